@@ -1,0 +1,98 @@
+"""What a look-ahead needs from a simulator: many simulated states side by side.
+
+A forward model keeps rows. A row is one simulated state. Rows are filled from the states of real
+environments (:meth:`ForwardModel.read_roots`, :meth:`ForwardModel.set_roots`), gathered
+(:meth:`ForwardModel.select`) and stepped together (:meth:`ForwardModel.step`). Nothing that a
+model does is visible in a real environment.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+#: One array ``[rows, *shape]``, or one per key for a Dict observation space.
+Observations = np.ndarray | dict[str, np.ndarray]
+
+
+class Transition(NamedTuple):
+    """What one simulated step of every row gave.
+
+    :param observations: ``[rows, *obs_shape]`` (or a dict of such arrays), in the dtype that the
+        real environment returns.
+    :param rewards: ``[rows]`` float64, as the real environment returns them.
+    :param terminated: ``[rows]`` bool. A ``TimeLimit`` never shows here.
+    :param valid: ``[rows]`` bool. False where the simulation diverged: nothing else that the row
+        says may be used, and stepping it again has no meaning.
+    """
+
+    observations: Observations
+    rewards: np.ndarray
+    terminated: np.ndarray
+    valid: np.ndarray
+
+
+class ForwardModel(ABC):
+    """Many simulated states of one or more real environments.
+
+    :ivar deterministic: whether the same state and action always give the same transition. A
+        search then simulates the first step of a candidate once for all its simulations.
+    """
+
+    deterministic: bool
+
+    @property
+    @abstractmethod
+    def n_rows(self) -> int:
+        """Number of simulated states held at present."""
+
+    @abstractmethod
+    def read_roots(self, env_indices: Sequence[int]) -> list[Any]:
+        """Read the present states of real environments.
+
+        :param env_indices: which environments, by their position in the vectorized environment.
+        :return: one opaque root per environment, to be given to :meth:`set_roots`.
+        """
+
+    @abstractmethod
+    def set_roots(self, roots: Sequence[Any], index: np.ndarray, rng: np.random.Generator) -> None:
+        """Make row i a simulation that starts at ``roots[index[i]]``.
+
+        :param roots: what :meth:`read_roots` returned.
+        :param index: ``[rows]`` integers into ``roots``, non-decreasing; the model then has
+            ``len(index)`` rows.
+        :param rng: where rows with random dynamics take their generators from, so that a
+            look-ahead never sees the real environment's future random draws. A deterministic model
+            draws nothing from it.
+        """
+
+    @abstractmethod
+    def select(self, index: np.ndarray) -> None:
+        """Make row i what row ``index[i]`` was: copies, drops and reorders rows.
+
+        :param index: ``[new_rows]`` integers into the present rows, non-decreasing; a row that is
+            named twice is copied, one that is not named is dropped.
+        """
+
+    @abstractmethod
+    def step(self, actions: np.ndarray) -> Transition:
+        """Step every row once.
+
+        :param actions: ``[rows, *act_shape]``, in the action space of the environment (not scaled
+            to [-1, 1]), in its dtype. Row i's numbers reach the simulator as they are.
+        :return: the transition. Its arrays belong to the caller until the next call.
+        """
+
+    def refresh(self) -> None:
+        """Take over what the real environments' simulators are now, after they were edited.
+
+        :raises ForwardModelError: if this model cannot follow the edit.
+        """
+
+    def close(self) -> None:
+        """Release threads, processes and copies of environments."""
+
+
+class ForwardModelError(RuntimeError):
+    """No forward model can simulate this environment, or not any longer; the message says why."""
