@@ -38,9 +38,13 @@ class ForwardModel(ABC):
 
     :ivar deterministic: whether the same state and action always give the same transition. A
         search then simulates the first step of a candidate once for all its simulations.
+    :ivar kind: the backend, ``"mujoco"`` or ``"pool"``; what ``forward_model=`` asks for.
+    :ivar description: one line for a log: which backend, and why if it was chosen by itself.
     """
 
     deterministic: bool
+    kind: str
+    description: str
 
     @property
     @abstractmethod
@@ -81,16 +85,16 @@ class ForwardModel(ABC):
 
         :param actions: ``[rows, *act_shape]``, in the action space of the environment (not scaled
             to [-1, 1]), in its dtype. Row i's numbers reach the simulator as they are.
-        :return: the transition. Its arrays belong to the caller until the next call.
+        :return: the transition. Its arrays are valid until the next call, which may overwrite them.
         """
 
-    def refresh(self) -> None:
+    def refresh(self) -> None:  # noqa: B027
         """Take over what the real environments' simulators are now, after they were edited.
 
         :raises ForwardModelError: if this model cannot follow the edit.
         """
 
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027
         """Release threads, processes and copies of environments."""
 
 

@@ -1,0 +1,84 @@
+"""
+Adds sb3-mcbs to RL Zoo when, and only when, RL Zoo is imported.
+
+RL Zoo has no place where a package could register an algorithm, so a ``.pth`` line imports this module at
+interpreter start. It therefore stands alone and imports nothing that the interpreter has not loaded already:
+all it does is to put a finder that waits for RL Zoo's modules in front of ``sys.meta_path``.
+Set the environment variable ``SB3_MCBS_NO_ZOO_HOOK=1`` to switch it off.
+"""
+
+import os
+import sys
+
+TYPE_CHECKING = False  # importing typing would take longer than all the rest of this module
+if TYPE_CHECKING:
+    from typing import Any
+
+SWITCH = "SB3_MCBS_NO_ZOO_HOOK"
+# The last one is ours: whoever imports it first imports rl_zoo3.exp_manager half-way through it, when the
+# class that belongs into rl_zoo3.exp_manager does not exist yet.
+WATCHED = ("rl_zoo3.utils", "rl_zoo3.hyperparams_opt", "rl_zoo3.exp_manager", "sb3_mcbs.zoo.manager")
+
+
+def _register(module: "Any") -> None:
+    try:
+        from sb3_mcbs.zoo import registration
+
+        registration.after_import(module)
+    except Exception as error:
+        import warnings
+
+        warnings.warn(
+            f"sb3-mcbs could not register its algorithms when {module.__name__} was imported "
+            f"({type(error).__name__}: {error}). RL Zoo's own algorithms are not affected. Repair the "
+            f"installation (pip install --force-reinstall sb3-mcbs), or set {SWITCH}=1 to silence this.",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+
+
+class ZooFinder:
+    """Finds nothing by itself: lets the other finders find RL Zoo's modules and registers after these ran."""
+
+    def find_spec(self, fullname: str, path: "Any" = None, target: "Any" = None) -> "Any":
+        """
+        :param fullname: name of the module that is being imported
+        :param path: ``__path__`` of its package
+        :param target: the module itself if it is being reloaded
+        :return: the spec the other finders gave, or None for every module but the watched ones
+        """
+        if fullname not in WATCHED:
+            return None
+        for finder in sys.meta_path:
+            find_spec = getattr(finder, "find_spec", None)
+            # By name: another copy of this module would ask this finder in turn, without an end.
+            if type(finder).__name__ == "ZooFinder" or find_spec is None:
+                continue
+            spec = find_spec(fullname, path, target)
+            if spec is not None:
+                return _announcing(spec)
+        return None
+
+
+def _announcing(spec: "Any") -> "Any":
+    loader = spec.loader
+    execute = loader.exec_module
+
+    def exec_module(module: "Any") -> None:
+        execute(module)
+        _register(module)
+
+    # On the instance, so that the loader keeps its class and with it all that other tools ask of a loader.
+    loader.exec_module = exec_module
+    return spec
+
+
+def install() -> None:
+    """Put the finder in place, once, unless the environment says no."""
+    if os.environ.get(SWITCH, "0") not in ("", "0"):
+        return
+    if not any(type(finder).__name__ == "ZooFinder" for finder in sys.meta_path):
+        sys.meta_path.insert(0, ZooFinder())
+
+
+install()

@@ -1,0 +1,14 @@
+"""Look-ahead for Stable-Baselines3 agents: Monte Carlo Beam Search in exact copies of the simulator."""
+
+from importlib.metadata import PackageNotFoundError, version
+
+from sb3_mcbs.algorithms import MCBSTD3, SearchPolicy
+from sb3_mcbs.search import SearchSettings
+from sb3_mcbs.snapshot import SnapshotEnvWrapper
+
+try:
+    __version__ = version("sb3-mcbs")
+except PackageNotFoundError:  # a checkout that was not installed
+    __version__ = "0+unknown"
+
+__all__ = ["MCBSTD3", "SearchPolicy", "SearchSettings", "SnapshotEnvWrapper", "__version__"]

@@ -1,0 +1,115 @@
+"""Act with search with any trained agent."""
+
+from dataclasses import replace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+
+from sb3_mcbs.algorithms.mcbs_td3 import MCBSTD3
+from sb3_mcbs.algorithms.searcher import Searcher
+from sb3_mcbs.search import SearchResult, SearchSettings
+from sb3_mcbs.snapshot import SnapshotEnvWrapper
+
+
+class SearchPolicy:
+    """
+    A trained agent that looks ahead before it acts, with SB3's ``predict`` signature.
+
+    Every call of :meth:`predict` plans from the present states of ``vec_env``, so the actions are for that
+    environment and no other::
+
+        policy = SearchPolicy(model, vec_env, beam_width=6, rollout_depth=3)
+        evaluate_policy(policy, vec_env)
+
+    SAC and TQC propose their mean action; TQC's value is the mean over all quantiles of all critics.
+    Attributes that this class does not have are those of the agent (``save``, ``get_env``, ``logger``, ...).
+
+    :param model: a TD3, DDPG, SAC, TQC or MCBSTD3 agent
+    :param vec_env: the environment to act in, at most wrapped further by ``VecEnv`` wrappers that alter
+        nothing. Environments in this process are wrapped for snapshots in place. A ``gym.Env`` must be
+        wrapped in :class:`~sb3_mcbs.SnapshotEnvWrapper` outermost.
+    :param seed: seed of the search's own generator; None: a fresh one
+    :param normalize_reward: whether the critics were trained on rewards that ``VecNormalize`` scaled.
+        None: found out from the environment that the agent was trained in, or assumed from the statistics
+    :param search_settings: the fields of :class:`~sb3_mcbs.SearchSettings`; those not given are an
+        MCBSTD3 agent's own, or the defaults
+    """
+
+    def __init__(
+        self,
+        model: OffPolicyAlgorithm,
+        vec_env: VecEnv | gym.Env,
+        seed: int | None = None,
+        normalize_reward: bool | None = None,
+        **search_settings: Any,
+    ) -> None:
+        unknown = sorted(set(search_settings) - set(SearchSettings.names()))
+        if unknown:
+            raise TypeError(f"Unknown search settings {unknown}; known are {list(SearchSettings.names())}.")
+        settings = model.search_settings if isinstance(model, MCBSTD3) else SearchSettings()
+        self.model = model
+        self.settings = replace(settings, **search_settings)
+        self.vec_env = _as_vec_env(vec_env)
+        self.rng = np.random.default_rng(seed)
+        self.last_result: SearchResult | None = None
+        self.searcher = Searcher(model, self.vec_env, self.settings, normalize_reward)
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """
+        Search for the best actions in the present states of ``vec_env``.
+
+        :param observation: the present observations of ``vec_env``
+        :param state: not used
+        :param episode_start: not used
+        :param deterministic: has no effect. The best candidate is always taken, without exploration noise;
+            the candidates are random draws from this object's own generator in either case, so the same
+            ``seed`` and the same calls give the same actions.
+        :return: the actions and ``state``
+        """
+        space = self.model.observation_space
+        batched, is_single = _add_batch_axis(observation, space)
+        self.last_result = self.searcher.search(batched, self.rng)
+        actions = self.searcher.unscale(self.last_result.actions)
+        return (actions[0] if is_single else actions), state
+
+    def close(self) -> None:
+        """Release the forward model. The agent and the environment stay open."""
+        self.searcher.close()
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "model" or name.startswith("__"):
+            raise AttributeError(name)
+        return getattr(self.model, name)
+
+
+def _as_vec_env(env: VecEnv | gym.Env) -> VecEnv:
+    if isinstance(env, VecEnv):
+        return env
+    if isinstance(env, SnapshotEnvWrapper):
+        return DummyVecEnv([lambda: env])
+    raise TypeError(
+        f"SearchPolicy plans from the states of a vectorized environment, got {type(env).__name__}. Pass "
+        "make_vec_env(...), or a gym.Env wrapped in SnapshotEnvWrapper outermost, and act in the same object."
+    )
+
+
+def _add_batch_axis(observation: Any, space: gym.Space) -> tuple[Any, bool]:
+    """Give a single observation the axis of environments.
+
+    :return: the batched observation, and whether the axis was added.
+    """
+    if isinstance(space, gym.spaces.Dict):
+        key = next(iter(space.spaces))
+        is_single = np.ndim(observation[key]) == len(space[key].shape or ())
+        return ({k: np.asarray(v)[None] for k, v in observation.items()} if is_single else observation), is_single
+    is_single = np.ndim(observation) == len(space.shape or ())
+    return (np.asarray(observation)[None] if is_single else observation), is_single

@@ -1,0 +1,207 @@
+"""Joins an agent's networks, the environments it acts in and a forward model to a search."""
+
+import logging
+import warnings
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_mcbs.algorithms.networks import check_agent, policy_function, value_function
+from sb3_mcbs.algorithms.vec_env_view import VecEnvView, reward_normalizer, snapshot_environments
+from sb3_mcbs.models import Environments, ForwardModel, ForwardModelError, make_forward_model
+from sb3_mcbs.models.base import Observations
+from sb3_mcbs.search import Agent, SearchResult, SearchSettings, beam_search, draw_noise
+from sb3_mcbs.snapshot import SnapshotEnvWrapper
+
+logger = logging.getLogger("sb3_mcbs")
+
+
+class Searcher:
+    """Searches for an agent from the present states of the environments that it acts in.
+
+    :param agent: a TD3, DDPG, SAC or TQC agent.
+    :param vec_env: the environments; those in this process are wrapped in place.
+    :param settings: settings of the search.
+    :param normalize_reward: see :class:`~sb3_mcbs.SearchPolicy`.
+    :raises SnapshotUnsupportedError: if an environment's state cannot be captured.
+    :raises ForwardModelError: if the requested forward model cannot simulate the environments.
+    """
+
+    def __init__(
+        self,
+        agent: OffPolicyAlgorithm,
+        vec_env: VecEnv,
+        settings: SearchSettings,
+        normalize_reward: bool | None = None,
+    ) -> None:
+        check_agent(agent)
+        self.agent = agent
+        self.settings = settings
+        self.model: ForwardModel | None = None
+        self._policy, self._value = policy_function(agent), value_function(agent)
+        self._previous_step_differed = False
+        if settings.rollout_depth > 0:
+            self.view = VecEnvView(vec_env, reward_normalizer(agent.get_env(), vec_env, normalize_reward))
+            self.environments: Environments = snapshot_environments(self.view.base)
+            self._env_indices = range(len(self.environments))
+            self.model = make_forward_model(self.environments, settings.forward_model, settings.n_threads)
+
+    @property
+    def description(self) -> str:
+        """One line that says what simulates."""
+        return "none: the critics rank the candidates" if self.model is None else self.model.description
+
+    def search(self, observations: Observations, rng: np.random.Generator) -> SearchResult:
+        """Choose an action for every environment.
+
+        :param observations: ``[n_envs, *]``, the environments' present observations as the agent got them.
+        :param rng: the search's own generator.
+        :return: actions, and what the search found.
+        :raises ValueError: if the observations are not those of the environments' present states.
+        """
+        if self.agent.policy.training:
+            self.agent.policy.set_training_mode(False)
+        roots: list[Any] = []
+        if self.model is not None:
+            roots = self.model.read_roots(self._env_indices)
+            observations = self._present_observations(observations)
+        n_envs = _n_rows(observations)
+        act_dim = int(np.prod(self.agent.action_space.shape))
+        noise = draw_noise(rng, self.settings, n_envs, act_dim)
+        return beam_search(self.model, roots, observations, self.agent_functions(), self.settings, noise, rng)
+
+    def model_error(
+        self, result: SearchResult, observations: Observations, rewards: np.ndarray, infos: list[dict[str, Any]]
+    ) -> float | None:
+        """Compare what the search predicted for the executed actions with what happened.
+
+        A difference in a deterministic environment means that it was edited, or that it is not
+        deterministic after all: the forward model is refreshed, then replaced, then told so.
+
+        :param result: the decision whose actions were executed.
+        :param observations: ``[n_envs, *]``, what the agent received next.
+        :param rewards: ``[n_envs]``, of the environments, not normalised.
+        :param infos: one per environment; where an episode ended the last observation is in it.
+        :return: the largest absolute difference in observations (as the networks see them) and rewards, or
+            ``None`` if the forward model does not claim to be deterministic or nothing was simulated.
+        """
+        if self.model is None or not self.model.deterministic or result.first_step is None:
+            return None
+        predicted = self.view.observe(result.first_step.observations)
+        error = 0.0
+        for env in np.flatnonzero(result.chosen >= 0):
+            real = infos[env].get("terminal_observation")
+            if real is None:
+                real = _row(observations, env)
+            error = max(error, _difference(_row(predicted, env), real))
+            # A vectorized environment hands rewards on as float32.
+            error = max(error, _difference(np.float32(result.first_step.rewards[env]), np.float32(rewards[env])))
+        if error > 0:
+            self._follow_environment(error)
+        self._previous_step_differed = error > 0
+        return error
+
+    def close(self) -> None:
+        """Release the forward model."""
+        if self.model is not None:
+            self.model.close()
+
+    def agent_functions(self) -> Agent:
+        """The agent as the search knows it: functions of the environments' own observations."""
+        if self.model is None:
+            return Agent(self._policy, self._value, self.agent.gamma, self.unscale, lambda rewards: rewards)
+        observe = self.view.observe
+        return Agent(
+            policy=lambda observations: self._policy(observe(observations)),
+            value=lambda observations, actions: self._value(observe(observations), actions),
+            gamma=self.agent.gamma,
+            unscale_action=self.unscale,
+            scale_reward=self.view.scale_reward,
+        )
+
+    def unscale(self, actions: np.ndarray) -> np.ndarray:
+        """Turn scaled actions into actions of the environment.
+
+        :param actions: ``[rows, act_dim]`` in [-1, 1].
+        :return: ``[rows, *act_shape]``.
+        """
+        return self.agent.policy.unscale_action(actions.reshape(-1, *self.agent.action_space.shape))
+
+    def _present_observations(self, observations: Observations) -> Observations:
+        """The environments' own observations, checked against those that the agent was given."""
+        present = self.environments.apply(self._env_indices, _last_observation)
+        if any(observation is None for observation in present):
+            raise ValueError("Reset the vectorized environment before the first search.")
+        stacked = _stack(present)
+        if not _equal(self.view.observe(stacked), observations):
+            raise ValueError(
+                "The observations to act on are not those of the environments' present states. A search plans from "
+                "the environments it was given: act in those, step them only through their SnapshotEnvWrapper, and "
+                "keep wrappers that alter observations inside it."
+            )
+        return stacked
+
+    def _follow_environment(self, error: float) -> None:
+        assert self.model is not None
+        message = f"The forward model's prediction differs from the environment by {error:.3g}. "
+        is_pool = self.model.kind == "pool"
+        if is_pool:
+            self.model.deterministic = False
+            self._warn(message + "Its dynamics are random; every simulation now draws its own randomness.")
+            return
+        if not self._previous_step_differed:
+            try:
+                self.model.refresh()
+                self._warn(message + "It was edited; the forward model was rebuilt from its present values.")
+                return
+            except ForwardModelError as reason:
+                message += f"{reason} "
+        if self.settings.forward_model != "auto":
+            raise ForwardModelError(message + "forward_model='pool' copies whole environments and can follow.")
+        self.model.close()
+        self.model = make_forward_model(self.environments, "pool", self.settings.n_threads)
+        self._warn(message + f"Now simulating with: {self.model.description}.")
+
+    @staticmethod
+    def _warn(message: str) -> None:
+        logger.warning(message)
+        warnings.warn(message, stacklevel=4)
+
+
+def _last_observation(env: SnapshotEnvWrapper) -> Any:
+    return env.last_observation
+
+
+def _stack(observations: list[Any]) -> Observations:
+    if isinstance(observations[0], dict):
+        return {key: np.stack([observation[key] for observation in observations]) for key in observations[0]}
+    return np.stack(observations)
+
+
+def _row(observations: Observations, index: int) -> Any:
+    if isinstance(observations, dict):
+        return {key: value[index] for key, value in observations.items()}
+    return observations[index]
+
+
+def _n_rows(observations: Observations) -> int:
+    return len(next(iter(observations.values()))) if isinstance(observations, dict) else len(observations)
+
+
+def _equal(left: Observations, right: Observations) -> bool:
+    if isinstance(left, dict):
+        return isinstance(right, dict) and all(np.array_equal(left[key], right[key]) for key in left)
+    return np.array_equal(left, right)
+
+
+def _difference(left: Any, right: Any) -> float:
+    """Largest absolute difference; two NaNs are equal, a NaN and a number are infinitely far apart."""
+    if isinstance(left, dict):
+        return max(_difference(left[key], right[key]) for key in left)
+    left, right = np.asarray(left, np.float64), np.asarray(right, np.float64)
+    if np.array_equal(left, right, equal_nan=True):
+        return 0.0
+    difference = np.abs(left - right)
+    return float(np.where(np.isnan(difference), np.inf, difference).max())

@@ -1,0 +1,157 @@
+"""What the layers of a vectorized environment do to observations and rewards.
+
+A forward model simulates the environments themselves. The networks see observations through the
+``VecEnv`` wrappers around them, so a search has to apply the same wrappers to simulated observations,
+without changing their statistics.
+"""
+
+import warnings
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    SubprocVecEnv,
+    VecCheckNan,
+    VecEnv,
+    VecExtractDictObs,
+    VecMonitor,
+    VecNormalize,
+    VecTransposeImage,
+    VecVideoRecorder,
+    unwrap_vec_normalize,
+)
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvWrapper
+
+from sb3_mcbs.models import Environments, LocalEnvironments, WorkerEnvironments
+from sb3_mcbs.models.base import Observations
+from sb3_mcbs.snapshot import SnapshotEnvWrapper
+
+_TRANSPARENT = (VecCheckNan, VecMonitor, VecVideoRecorder)
+_PURE = (VecNormalize, VecTransposeImage, VecExtractDictObs)
+
+
+class VecEnvView:
+    """Observations and rewards of a vectorized environment as an agent's networks see them.
+
+    :param vec_env: the environment that the agent acts in.
+    :param reward_normalizer: the ``VecNormalize`` whose reward scale the critics learned, if any.
+    :raises ValueError: if a wrapper may alter observations or actions in a way that is not known.
+    """
+
+    def __init__(self, vec_env: VecEnv, reward_normalizer: VecNormalize | None) -> None:
+        self.vec_env = vec_env
+        self.reward_normalizer = reward_normalizer
+        self.layers: list[VecEnvWrapper] = []
+        while isinstance(vec_env, VecEnvWrapper):
+            if type(vec_env) in _PURE:
+                self.layers.insert(0, vec_env)
+            elif type(vec_env) not in _TRANSPARENT:
+                known = ", ".join(cls.__name__ for cls in _PURE + _TRANSPARENT)
+                raise ValueError(
+                    f"Look-ahead cannot see through the vectorized wrapper {type(vec_env).__name__}: it may alter "
+                    f"observations, actions or rewards. Known are {known}. Use a Gymnasium wrapper inside the "
+                    "environment instead (FrameStackObservation for VecFrameStack, for example), or rollout_depth=0."
+                )
+            vec_env = vec_env.venv
+        self.base: VecEnv = vec_env
+
+    def observe(self, observations: Observations) -> Observations:
+        """Pass observations of the environments through the wrappers.
+
+        :param observations: ``[rows, *obs_shape]`` as the environments return them.
+        :return: ``[rows, *]`` as the networks expect them.
+        """
+        observations = _as_space_dtype(observations, self.base.observation_space)
+        for layer in self.layers:
+            if isinstance(layer, VecNormalize):
+                observations = layer.normalize_obs(observations)
+            elif isinstance(layer, VecTransposeImage):
+                observations = layer.transpose_observations(observations)
+            else:
+                observations = observations[layer.key]
+        return observations
+
+    def scale_reward(self, rewards: np.ndarray) -> np.ndarray:
+        """Bring rewards to the scale on which the critics were trained.
+
+        :param rewards: ``[rows]`` as the environments return them.
+        :return: ``[rows]``.
+        """
+        normalizer = self.reward_normalizer
+        if normalizer is None:
+            return rewards
+        scaled = rewards / np.sqrt(normalizer.ret_rms.var + normalizer.epsilon)
+        return np.clip(scaled, -normalizer.clip_reward, normalizer.clip_reward)
+
+
+def reward_normalizer(training_env: VecEnv | None, vec_env: VecEnv, normalize_reward: bool | None) -> VecNormalize | None:
+    """Find the reward scale that the critics learned.
+
+    :param training_env: the environment that the agent was trained in, if it is at hand.
+    :param vec_env: the environment that it acts in; for evaluation ``norm_reward`` is usually off there
+        although its statistics hold the scale.
+    :param normalize_reward: whether the critics learned from normalised rewards. ``None``: as
+        ``training_env`` says; if that is not at hand but ``vec_env`` has statistics, they are used.
+    :return: the layer whose ``ret_rms`` is the scale, or ``None`` if rewards were not normalised.
+    :raises ValueError: if rewards were normalised but no statistics can be found.
+    """
+    trained_with = unwrap_vec_normalize(training_env) if training_env is not None else None
+    acts_with = unwrap_vec_normalize(vec_env)
+    if normalize_reward is None:
+        if training_env is not None and training_env is not vec_env:
+            normalize_reward = trained_with is not None and trained_with.norm_reward
+        elif acts_with is None or acts_with.norm_reward:
+            normalize_reward = acts_with is not None
+        else:
+            normalize_reward = _has_return_statistics(acts_with)
+            if normalize_reward:
+                warnings.warn(
+                    "The environment's VecNormalize has return statistics but does not normalise rewards now. The "
+                    "search assumes that the critics were trained on normalised rewards; pass "
+                    "normalize_reward=True or False to say what is true.",
+                    stacklevel=3,
+                )
+    if not normalize_reward:
+        return None
+    normalizer = trained_with or acts_with
+    if normalizer is None:
+        raise ValueError("normalize_reward=True needs a VecNormalize around the environment, with its statistics.")
+    return normalizer
+
+
+def snapshot_environments(vec_env: VecEnv) -> Environments:
+    """Reach the environments inside a vectorized one, wrapping them if that is possible.
+
+    Environments in this process are wrapped in place; those of a ``SubprocVecEnv`` cannot be wrapped
+    afterwards.
+
+    :param vec_env: the innermost vectorized environment.
+    :return: access to the environments where they live.
+    :raises ValueError: if the environments of worker processes are not wrapped.
+    :raises TypeError: if the vectorized environment is of another kind.
+    """
+    if isinstance(vec_env, DummyVecEnv):
+        vec_env.envs = [SnapshotEnvWrapper(env) for env in vec_env.envs]
+        return LocalEnvironments(vec_env.envs)
+    if isinstance(vec_env, SubprocVecEnv):
+        if not all(vec_env.env_is_wrapped(SnapshotEnvWrapper)):
+            raise ValueError(
+                "The environments of a SubprocVecEnv live in worker processes and cannot be wrapped afterwards. Wrap "
+                "them when they are made: make_vec_env(..., wrapper_class=SnapshotEnvWrapper), or in an RL Zoo "
+                "hyperparameter file the line\n  env_wrapper: sb3_mcbs.SnapshotEnvWrapper"
+            )
+        return WorkerEnvironments(vec_env)
+    raise TypeError(f"Look-ahead needs a DummyVecEnv or a SubprocVecEnv, got {type(vec_env).__name__}.")
+
+
+def _has_return_statistics(normalizer: VecNormalize) -> bool:
+    return float(normalizer.ret_rms.count) >= 1.0
+
+
+def _as_space_dtype(observations: Observations, space: spaces.Space) -> Observations:
+    if isinstance(space, spaces.Dict):
+        assert isinstance(observations, dict)
+        return {key: np.asarray(value).astype(space[key].dtype, copy=False) for key, value in observations.items()}
+    assert isinstance(observations, np.ndarray)
+    return observations.astype(space.dtype, copy=False)

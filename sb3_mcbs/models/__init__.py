@@ -1,0 +1,31 @@
+"""Forward models: many simulated states of real environments, side by side."""
+
+from sb3_mcbs.models import gymnasium_families as _families
+from sb3_mcbs.models import gymnasium_small_families as _small_families
+from sb3_mcbs.models.base import ForwardModel, ForwardModelError, Observations, Transition
+from sb3_mcbs.models.environments import Environments, LocalEnvironments, WorkerEnvironments
+from sb3_mcbs.models.factory import make_forward_model
+from sb3_mcbs.models.families import Constants, Family, Fields, Outcome, Rows, register_family
+from sb3_mcbs.models.mujoco_batch import MujocoBatchModel
+from sb3_mcbs.models.pool import EnvPoolModel
+
+del _families, _small_families
+
+__all__ = [
+    "Constants",
+    "EnvPoolModel",
+    "Environments",
+    "Family",
+    "Fields",
+    "ForwardModel",
+    "ForwardModelError",
+    "LocalEnvironments",
+    "MujocoBatchModel",
+    "Observations",
+    "Outcome",
+    "Rows",
+    "Transition",
+    "WorkerEnvironments",
+    "make_forward_model",
+    "register_family",
+]

@@ -1,0 +1,214 @@
+"""Real copies of one environment, stepped as the rows of a pool.
+
+The functions at the end run where the environment lives, and find its copies by the pool's name.
+"""
+
+from contextlib import nullcontext
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.envs.mujoco import MujocoEnv
+
+from sb3_mcbs.models.base import Observations
+from sb3_mcbs.models.engines import clear_warnings, has_diverged
+from sb3_mcbs.models.probing import Randomness, isolated_globals, probe_randomness
+from sb3_mcbs.snapshot import Snapshot, SnapshotEnvWrapper
+
+
+def stack(observations: list[Any]) -> Observations:
+    """``[rows, *obs_shape]`` from single observations, per key where they are dicts."""
+    if isinstance(observations[0], dict):
+        return {key: np.stack([one[key] for one in observations]) for key in observations[0]}
+    return np.stack(observations)
+
+
+def _copied(observation: Any) -> Any:
+    if isinstance(observation, dict):
+        return {key: np.array(value) for key, value in observation.items()}
+    return np.array(observation)
+
+
+def _blank(space: spaces.Space) -> Any:
+    """An observation for a row that never gave one."""
+    if isinstance(space, spaces.Dict):
+        return {key: _blank(inner) for key, inner in space.spaces.items()}
+    return np.zeros(space.shape or (), dtype=space.dtype)
+
+
+def _is_finite(observation: Any) -> bool:
+    values = observation.values() if isinstance(observation, dict) else (observation,)
+    return all(bool(np.isfinite(v).all()) for v in values if np.issubdtype(v.dtype, np.inexact))
+
+
+class _Row:
+    """One copy, and what its last step gave.
+
+    :ivar ended: no further steps: the episode terminated, or the simulation is of no use.
+    """
+
+    def __init__(self, env: SnapshotEnvWrapper) -> None:
+        self.env = env
+        self.observation = _blank(env.observation_space)
+        self.reward = 0.0
+        self.ended = self.terminated = False
+        self.valid = True
+
+    def start(self, snapshot: Snapshot, rng: np.random.Generator) -> None:
+        """Restore a snapshot, with random generators of the look-ahead's own."""
+        self.env.restore(snapshot, rng=rng)
+        self.ended = self.terminated = False
+        self.valid = True
+
+    def become(self, other: "_Row", snapshot: Snapshot | None, rng: np.random.Generator) -> None:
+        """Take over another row's state, with random generators of its own.
+
+        :param other: the row.
+        :param snapshot: of its copy; None if it has ended.
+        :param rng: where the generators come from.
+        """
+        if snapshot is not None:
+            self.env.restore(snapshot, rng=rng)
+        self.observation, self.reward = other.observation, other.reward
+        self.ended, self.terminated, self.valid = other.ended, other.terminated, other.valid
+
+    def step(self, action: np.ndarray) -> Exception | None:
+        """Step the copy once, unless it has ended.
+
+        :param action: for this row; copied, since an environment may keep it.
+        :return: what the environment raised.
+        """
+        self.reward = 0.0
+        if self.ended:
+            return None
+        base = self.env.unwrapped
+        simulator = base.data if isinstance(base, MujocoEnv) else None
+        if simulator is not None:
+            clear_warnings(simulator)
+        try:
+            observation, reward, terminated, _, _ = self.env.step(action.copy())
+        except Exception as error:
+            self.ended, self.valid = True, False
+            return error
+        self.observation, self.reward, self.terminated = _copied(observation), float(reward), bool(terminated)
+        self.valid = _is_finite(self.observation) and bool(np.isfinite(self.reward))
+        if simulator is not None:
+            self.valid = self.valid and not has_diverged(simulator)
+        # Truncation is left out on purpose: a time limit does not end a simulation.
+        self.ended = self.terminated or not self.valid
+        return None
+
+
+class Copies:
+    """The rows of one environment."""
+
+    def __init__(self) -> None:
+        #: Whether the environment draws from the global generators.
+        self.isolate = False
+        self.rows: list[_Row] = []
+        self._spare: list[_Row] = []
+        self._rng = np.random.default_rng(0)
+
+    def _take(self, wrapper: SnapshotEnvWrapper) -> _Row:
+        return self._spare.pop() if self._spare else _Row(wrapper.clone())
+
+    def set_rows(
+        self, wrapper: SnapshotEnvWrapper, snapshots: list[Snapshot], counts: list[int], seed: int
+    ) -> None:
+        """Make ``counts[i]`` rows that start at ``snapshots[i]``."""
+        self._rng = np.random.default_rng(seed)
+        self._spare += self.rows
+        self.rows = []
+        for snapshot, count in zip(snapshots, counts, strict=True):
+            for _ in range(count):
+                row = self._take(wrapper)
+                self.rows.append(row)
+                row.start(snapshot, self._rng)
+
+    def select(self, wrapper: SnapshotEnvWrapper, index: np.ndarray) -> None:
+        """Make row i what row ``index[i]`` was."""
+        named = set(index.tolist())
+        self._spare += [row for number, row in enumerate(self.rows) if number not in named]
+        chosen: list[_Row] = []
+        first: dict[int, _Row] = {}
+        snapshots: dict[int, Snapshot | None] = {}
+        for number in index.tolist():
+            if number not in first:
+                row = first[number] = self.rows[number]
+            else:
+                source = first[number]
+                if number not in snapshots:
+                    snapshots[number] = None if source.ended else source.env.snapshot()
+                row = self._take(wrapper)
+                row.become(source, snapshots[number], self._rng)
+            chosen.append(row)
+        self.rows = chosen
+
+    def step(self, actions: np.ndarray) -> tuple[list[Any], np.ndarray, np.ndarray, np.ndarray, str]:
+        """Step every row.
+
+        :param actions: ``[rows, *act_shape]``.
+        :return: observations (one per row), rewards, terminated and valid ``[rows]``, and the first
+            error that an environment raised.
+        """
+        isolation = isolated_globals(int(self._rng.integers(2**32))) if self.isolate else nullcontext()
+        with isolation:
+            errors = [row.step(action) for row, action in zip(self.rows, actions, strict=True)]
+        messages = [f"{type(error).__name__}: {error}" for error in errors if error is not None]
+        observations = [row.observation for row in self.rows]
+        rewards = np.array([row.reward for row in self.rows])
+        terminated = np.array([row.terminated for row in self.rows], dtype=bool)
+        valid = np.array([row.valid for row in self.rows], dtype=bool)
+        return observations, rewards, terminated, valid, messages[0] if messages else ""
+
+    def close(self) -> None:
+        """Close every copy."""
+        for row in (*self.rows, *self._spare):
+            row.env.close()
+        self.rows, self._spare = [], []
+
+
+# A pool's copies of an environment, next to it: in a worker process nothing else could hold them.
+_COPIES: WeakKeyDictionary[SnapshotEnvWrapper, dict[str, Copies]] = WeakKeyDictionary()
+
+
+def copies_of(wrapper: SnapshotEnvWrapper, pool: str) -> Copies:
+    """The copies that a pool keeps of an environment; none yet at first."""
+    return _COPIES.setdefault(wrapper, {}).setdefault(pool, Copies())
+
+
+def open_copies(wrapper: SnapshotEnvWrapper, pool: str) -> Randomness:
+    """Prepare to keep copies of an environment.
+
+    :return: what random numbers its steps use.
+    """
+    randomness = probe_randomness(wrapper)
+    copies_of(wrapper, pool).isolate = randomness.shared
+    return randomness
+
+
+def set_rows(wrapper: SnapshotEnvWrapper, pool: str, *args: Any) -> None:
+    """:meth:`Copies.set_rows`, next to the environment."""
+    copies_of(wrapper, pool).set_rows(wrapper, *args)
+
+
+def select_rows(wrapper: SnapshotEnvWrapper, pool: str, index: np.ndarray) -> None:
+    """:meth:`Copies.select`, next to the environment."""
+    copies_of(wrapper, pool).select(wrapper, index)
+
+
+def step_rows(wrapper: SnapshotEnvWrapper, pool: str, actions: np.ndarray) -> Any:
+    """:meth:`Copies.step`, next to the environment."""
+    return copies_of(wrapper, pool).step(actions)
+
+
+def drop_copies(wrapper: SnapshotEnvWrapper, pool: str) -> None:
+    """Close the copies that a pool keeps of an environment."""
+    copies_of(wrapper, pool).close()
+    del _COPIES[wrapper][pool]
+
+
+def read_snapshot(wrapper: SnapshotEnvWrapper) -> Snapshot:
+    """The environment's present state."""
+    return wrapper.snapshot()

@@ -1,0 +1,245 @@
+"""The forward model for known MuJoCo environments: physics on threads, the rest as array code."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from sb3_mcbs.models.base import ForwardModel, ForwardModelError, Transition
+from sb3_mcbs.models.engines import INTEGRATION, Engine, available_cpus, is_state_field, make_engine
+from sb3_mcbs.models.environments import Environments
+from sb3_mcbs.models.families import Rows, family_of
+from sb3_mcbs.models.recognition import (
+    CHECK_ROLLOUTS,
+    CHECK_STEPS,
+    KnownEnvironment,
+    Refusal,
+    Sample,
+    fields_of,
+    read_root,
+    recognize,
+    sample_transitions,
+)
+
+_FIRST_CAPACITY = 32
+
+
+class NotRecognizedError(ForwardModelError):
+    """The batch model refuses an environment.
+
+    :ivar notable: whether a user would have expected it to be taken.
+    """
+
+    def __init__(self, message: str, notable: bool = True) -> None:
+        super().__init__(message)
+        self.notable = notable
+
+
+class MujocoBatchModel(ForwardModel):
+    """Simulates environments of one registered family, bit for bit.
+
+    The main process simulates, wherever the environments live: a root is a small array. All
+    environments must be of one class, with the same arguments and the same model. The model is
+    copied; after an edit of it in the environments call :meth:`refresh`.
+
+    :param environments: the real environments.
+    :param n_threads: simulation threads; 0 takes one per processor that this process may use. The
+        numbers do not depend on it.
+    :raises ForwardModelError: if the environments are not of a known family, or if the model and a
+        copy of an environment disagree on random transitions.
+
+    :ivar kind: "mujoco".
+    :ivar description: one line that says what simulates.
+    """
+
+    deterministic = True
+    kind = "mujoco"
+
+    def __init__(self, environments: Environments, n_threads: int = 0) -> None:
+        if n_threads < 0:
+            raise ValueError(f"n_threads must be 0 (all processors) or more, got {n_threads}")
+        self._environments = environments
+        self._n_threads = n_threads or available_cpus()
+        self._engine: Engine | None = None
+        self._rows = 0
+        self.refresh()
+
+    @property
+    def n_rows(self) -> int:
+        return self._rows
+
+    def refresh(self) -> None:
+        known = self._recognize_all()
+        family = family_of(known.env_class)
+        assert family is not None
+        self._family = family
+        self._constants = known.constants
+        self._fields = fields_of(known)
+        self._lagging = tuple(name for name in self._fields.before if not is_state_field(name))
+        self._state_size = mujoco.mj_stateSize(known.constants.model, INTEGRATION)
+        self._build(_FIRST_CAPACITY)
+        self._rows = 0
+        n_threads = f"{self._n_threads} thread{'s' if self._n_threads > 1 else ''}"
+        kind = type(self._engine).__name__
+        self.description = f"MuJoCo batch of {known.env_class.__name__} ({kind}, {n_threads})"
+        try:
+            self._check()
+        except ForwardModelError:
+            raise
+        except Exception as error:
+            # An array function that does not fit: whoever asked for "auto" still has the pool.
+            raise NotRecognizedError(f"the check failed with {type(error).__name__}: {error}") from error
+
+    def _recognize_all(self) -> KnownEnvironment:
+        found = self._environments.apply(range(len(self._environments)), recognize)
+        for number, result in enumerate(found):
+            if isinstance(result, Refusal):
+                raise NotRecognizedError(f"environment {number}: {result.reason}", result.notable)
+        first: KnownEnvironment = found[0]
+        for number, other in enumerate(found[1:], start=1):
+            difference = _difference(first, other)
+            if difference:
+                raise NotRecognizedError(f"environments 0 and {number} differ in their {difference}")
+        return first
+
+    def _build(self, capacity: int) -> None:
+        """Make an engine for at least ``capacity`` rows, with empty rows."""
+        names = tuple(dict.fromkeys(("ctrl", *self._fields.before, *self._fields.after)))
+        if self._engine is not None:
+            self._engine.close()
+        try:
+            self._engine = make_engine(self._constants.model, capacity, names, self._n_threads)
+        except ValueError as error:
+            raise ForwardModelError(f"the batch cannot simulate this model: {error}") from error
+        self._constants.model = self._engine.model
+        self._capacity = capacity
+        self._arrays = {name: self._engine.field(name) for name in names}
+        self._before = {
+            name: np.zeros(self._arrays[name].shape, dtype=self._arrays[name].dtype)
+            for name in self._fields.before
+        }
+        self._diverged = np.zeros(capacity, dtype=bool)
+        self._ended = np.zeros(capacity, dtype=bool)
+        self._views: dict[int, tuple[Rows, Rows, np.ndarray]] = {}
+
+    def _memory(self) -> list[np.ndarray]:
+        """Everything that a row is, as ``[capacity, ...]`` arrays."""
+        assert self._engine is not None
+        return [
+            self._engine.state,
+            *(self._before[name] for name in self._lagging),
+            self._diverged,
+            self._ended,
+        ]
+
+    def _fill(self, values: Sequence[np.ndarray], rows: int) -> None:
+        """Set the first rows' memory, on a larger engine if this one is too small."""
+        if rows > self._capacity:
+            self._build(max(rows, 2 * self._capacity))
+        for memory, value in zip(self._memory(), values, strict=True):
+            memory[:rows] = value
+        self._rows = rows
+
+    def read_roots(self, env_indices: Sequence[int]) -> list[Any]:
+        return self._environments.apply(env_indices, read_root, self._state_size, self._lagging)
+
+    def set_roots(self, roots: Sequence[Any], index: np.ndarray, rng: np.random.Generator) -> None:
+        table = np.stack(roots)[index]
+        if table.shape[1] != self._state_size + sum(self._before[name][0].size for name in self._lagging):
+            raise ValueError("these roots were read by another model")
+        rows = len(table)
+        values, start = [table[:, : self._state_size]], self._state_size
+        for name in self._lagging:
+            shape = self._before[name].shape[1:]
+            size = int(np.prod(shape))
+            values.append(table[:, start : start + size].reshape(rows, *shape))
+            start += size
+        no_row = np.zeros(rows, dtype=bool)
+        self._fill([*values, no_row, no_row], rows)
+
+    def select(self, index: np.ndarray) -> None:
+        values = [memory[: self._rows].take(index, axis=0) for memory in self._memory()]
+        self._fill(values, len(index))
+
+    def _view(self, rows: int) -> tuple[Rows, Rows, np.ndarray]:
+        """The fields of the first rows, before and after a step, and their controls."""
+        view = self._views.get(rows)
+        if view is None:
+            before = Rows(**{name: self._before[name][:rows] for name in self._fields.before})
+            after = Rows(**{name: self._arrays[name][:rows] for name in self._fields.after})
+            view = self._views[rows] = (before, after, self._arrays["ctrl"][:rows])
+        return view
+
+    def step(self, actions: np.ndarray) -> Transition:
+        assert self._engine is not None
+        rows = self._rows
+        before, after, controls = self._view(rows)
+        if actions.shape != controls.shape:
+            raise ValueError(
+                f"expected actions of shape {controls.shape} [rows, act_dim], got {actions.shape}"
+            )
+        actions = np.ascontiguousarray(actions)
+        for name in self._fields.before:
+            if name not in self._lagging:
+                self._before[name][:rows] = self._arrays[name][:rows]
+        controls[...] = actions
+        diverged = self._engine.step(rows, self._constants.frame_skip)
+        observations, rewards, terminated = self._family.transition(self._constants, before, after, actions)
+        for name in self._lagging:
+            self._before[name][:rows] = self._arrays[name][:rows]
+        if not (np.isfinite(observations).all() and np.isfinite(rewards).all()):
+            diverged |= ~(np.isfinite(observations).reshape(rows, -1).all(axis=1) & np.isfinite(rewards))
+        # What a simulation does after its end is nobody's concern, so it cannot make it invalid.
+        self._diverged[:rows] |= diverged & ~self._ended[:rows]
+        self._ended[:rows] |= terminated
+        return Transition(observations, rewards, terminated, ~self._diverged[:rows])
+
+    def _check(self) -> None:
+        """Compare with copies of the real environments on random transitions.
+
+        :raises NotRecognizedError: at the first difference.
+        """
+        arguments = (self._state_size, self._lagging)
+        sample: Sample = self._environments.apply([0], sample_transitions, *arguments)[0]
+        rng = np.random.default_rng(0)
+        # All transitions as one batch, then the rollouts as they went on: the second also checks
+        # what a row carries from step to step.
+        flat = Sample(*(array.reshape(-1, 1, *array.shape[2:]) for array in sample))
+        for part in (flat, sample):
+            self.set_roots(list(part.roots[:, 0]), np.arange(len(part.roots)), rng)
+            for step in range(part.roots.shape[1]):
+                self._compare(self.step(part.actions[:, step]), part, step)
+        self._rows = 0
+
+    def _compare(self, simulated: Transition, real: Sample, step: int) -> None:
+        expected = (real.observations[:, step], real.rewards[:, step], real.terminated[:, step])
+        found: Sequence[Any] = simulated[:3]
+        for name, ours, theirs in zip(("observation", "reward", "terminated"), found, expected, strict=True):
+            if ours.dtype != theirs.dtype or ours.shape != theirs.shape:
+                kinds = f"{theirs.dtype} {theirs.shape[1:]}, the model's {ours.dtype} {ours.shape[1:]}"
+                raise NotRecognizedError(f"the check failed: the environment's {name} is {kinds}")
+            if ours.tobytes() != theirs.tobytes():
+                gap = np.abs(np.subtract(ours, theirs, dtype=np.float64)).max()
+                raise NotRecognizedError(
+                    f"the check failed: on {CHECK_ROLLOUTS * CHECK_STEPS} random transitions the {name} "
+                    f"of the model and of the environment differ by up to {gap:.3g}"
+                )
+
+    def close(self) -> None:
+        if self._engine is not None:
+            self._engine.close()
+
+
+def _difference(first: KnownEnvironment, other: KnownEnvironment) -> str:
+    """What distinguishes two environments, or nothing."""
+    if first.env_class is not other.env_class:
+        return f"class ({first.env_class.__name__}, {other.env_class.__name__})"
+    if first.constants.frame_skip != other.constants.frame_skip:
+        return f"frame_skip ({first.constants.frame_skip}, {other.constants.frame_skip})"
+    for name, value in first.constants.attributes.items():
+        if not np.array_equal(value, other.constants.attributes[name]):
+            return f"{name} ({value}, {other.constants.attributes[name]})"
+    if first.packed_model != other.packed_model:
+        return "MuJoCo models"
+    return ""

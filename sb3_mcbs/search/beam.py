@@ -1,0 +1,237 @@
+"""Monte Carlo Beam Search: Algorithm 1 of the paper for many environments at once.
+
+Arrays in, arrays out. Actions are scaled to [-1, 1] here, as a policy network gives them.
+Axes: ``n_envs`` environments, ``beam`` candidates, ``sim`` simulations, ``act_dim`` action entries.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sb3_mcbs.models.base import ForwardModel, Observations
+from sb3_mcbs.search.settings import SearchSettings
+
+
+class Agent(NamedTuple):
+    """What a search has to know of the agent.
+
+    :param policy: observations ``[rows, ...]`` -> actions ``[rows, act_dim]`` in [-1, 1], without
+        exploration noise.
+    :param value: observations ``[rows, ...]``, scaled actions ``[rows, act_dim]`` -> the critics'
+        estimate of the return ``[rows]``, already the minimum over the critics.
+    :param gamma: discount factor per environment step.
+    :param unscale_action: scaled actions ``[rows, act_dim]`` -> actions of the environment.
+    :param scale_reward: rewards of the environment ``[rows]`` -> the scale that the critics know.
+    """
+
+    policy: Callable[[Observations], np.ndarray]
+    value: Callable[[Observations, np.ndarray], np.ndarray]
+    gamma: float
+    unscale_action: Callable[[np.ndarray], np.ndarray]
+    scale_reward: Callable[[np.ndarray], np.ndarray]
+
+
+class Noise(NamedTuple):
+    """All random numbers of one decision.
+
+    :param beam: ``[n_envs, beam, act_dim]``, eta_i in Algorithm 1.
+    :param rollout: ``[rollout_depth, n_envs, beam, sim, act_dim]``, eta in ShortHorizon.
+    """
+
+    beam: np.ndarray
+    rollout: np.ndarray
+
+
+class FirstStep(NamedTuple):
+    """What the forward model says that the chosen actions will do.
+
+    :param observations: ``[n_envs, *obs_shape]``.
+    :param rewards: ``[n_envs]``, of the environment.
+    """
+
+    observations: Observations
+    rewards: np.ndarray
+
+
+class SearchResult(NamedTuple):
+    """The outcome of one decision in every environment.
+
+    :param actions: ``[n_envs, act_dim]``, the actions to execute, scaled.
+    :param chosen: ``[n_envs]``, which candidate that is; -1 where every candidate was invalid and the
+        policy's own action was taken.
+    :param candidates: ``[n_envs, beam, act_dim]``.
+    :param values: ``[n_envs, beam]``, Q~_i; -inf where a simulation of the candidate was invalid.
+    :param first_step: the chosen candidates' first simulated step (of their first simulation);
+        ``None`` if nothing was simulated. Meaningless where ``chosen`` is -1.
+    :param simulated_steps: environment steps that were simulated, each counted once.
+    :param invalid_rollouts: rollouts that diverged or whose value is not finite.
+    """
+
+    actions: np.ndarray
+    chosen: np.ndarray
+    candidates: np.ndarray
+    values: np.ndarray
+    first_step: FirstStep | None
+    simulated_steps: int
+    invalid_rollouts: int
+
+
+def draw_noise(rng: np.random.Generator, settings: SearchSettings, n_envs: int, act_dim: int) -> Noise:
+    """Draw the noise of one decision.
+
+    :param rng: generator of the search.
+    :param settings: width, depth, simulations and noise scales.
+    :param n_envs: number of environments.
+    :param act_dim: entries of one action.
+    :return: the noise, clipped to ``noise_clip`` if that is set.
+    """
+    b, d, n = settings.beam_width, settings.rollout_depth, settings.n_simulations
+    beam = _gaussian(rng, (n_envs, b, act_dim), settings.beam_noise, settings.noise_clip)
+    rollout = _gaussian(rng, (d, n_envs, b, n, act_dim), settings.effective_rollout_noise, settings.noise_clip)
+    return Noise(beam, rollout)
+
+
+def beam_search(
+    model: ForwardModel | None,
+    roots: Sequence[Any],
+    observations: Observations,
+    agent: Agent,
+    settings: SearchSettings,
+    noise: Noise,
+    rng: np.random.Generator,
+) -> SearchResult:
+    """Choose one action per environment (Algorithm 1, steps 1 to 3).
+
+    :param model: simulates the candidates; may be ``None`` if ``rollout_depth`` is 0.
+    :param roots: present states of the environments, from :meth:`ForwardModel.read_roots`.
+    :param observations: ``[n_envs, *obs_shape]``, present observations.
+    :param agent: networks, discount and scales.
+    :param settings: width, depth and simulations.
+    :param noise: from :func:`draw_noise`.
+    :param rng: given to a model with random dynamics, see :meth:`ForwardModel.set_roots`.
+    :return: actions, and what the search found.
+    """
+    policy_actions = agent.policy(observations)
+    candidates = np.clip(policy_actions[:, None] + noise.beam, -1.0, 1.0)
+    if settings.include_policy_action:
+        candidates[:, 0] = policy_actions
+
+    if settings.rollout_depth == 0:
+        values = _critic_values(observations, candidates, agent)[..., None]
+        first_step, simulated_steps = None, 0
+    else:
+        assert model is not None, "a rollout needs a forward model"
+        values, first_step, simulated_steps = _rollout_values(model, roots, candidates, agent, settings, noise, rng)
+
+    finite = np.isfinite(values)
+    invalid_rollouts = int(values.size - np.count_nonzero(finite))
+    means = values.mean(axis=2)
+    if invalid_rollouts:
+        means = np.where(finite.all(axis=2), means, -np.inf)
+    chosen = means.argmax(axis=1)
+    envs = np.arange(len(chosen))
+    actions = candidates[envs, chosen]
+    if first_step is not None:
+        first_step = _take_first_step(first_step, envs * settings.beam_width + chosen)
+    hopeless = ~np.isfinite(means[envs, chosen])
+    if hopeless.any():
+        actions[hopeless] = policy_actions[hopeless]
+        chosen[hopeless] = -1
+    return SearchResult(actions, chosen, candidates, means, first_step, simulated_steps, invalid_rollouts)
+
+
+def _rollout_values(
+    model: ForwardModel,
+    roots: Sequence[Any],
+    candidates: np.ndarray,
+    agent: Agent,
+    settings: SearchSettings,
+    noise: Noise,
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, FirstStep, int]:
+    """Evaluate ShortHorizon for every environment, candidate and simulation.
+
+    All rollouts advance together. ``rollout_of_row`` names the unfinished rollouts, in order; the
+    forward model holds one row for each of them, except before the first step in a deterministic
+    environment, where the simulations of a candidate still share one.
+
+    :return: values ``[n_envs, beam, sim]`` in float64 (NaN where a simulation was invalid), the first step of
+        every candidate ``[n_envs * beam]``, and the number of simulated steps.
+    """
+    n_envs, beam, act_dim = candidates.shape
+    depth_limit, n_sim = settings.rollout_depth, settings.n_simulations
+    if model.deterministic and settings.effective_rollout_noise == 0:
+        n_sim = 1  # all simulations of a candidate would be the same
+    n_first = 1 if model.deterministic else n_sim
+    rollout_noise = noise.rollout[:, :, :, :n_sim].reshape(depth_limit, n_envs * beam * n_sim, act_dim)
+
+    returns = np.zeros(n_envs * beam * n_sim)
+    rollout_of_row = np.arange(n_envs * beam * n_sim)
+    row_of_rollout = rollout_of_row // (n_sim // n_first)
+    discount = 1.0
+    simulated_steps = 0
+
+    model.set_roots(roots, np.repeat(np.arange(n_envs), beam * n_first), rng)
+    actions = np.repeat(candidates.reshape(-1, act_dim), n_first, axis=0)
+    for depth in range(depth_limit):
+        step = model.step(agent.unscale_action(actions))
+        simulated_steps += len(actions)
+        if depth == 0:
+            first_step = FirstStep(_take(step.observations, slice(None, None, n_first)), step.rewards[::n_first].copy())
+        rewards = np.where(step.valid, agent.scale_reward(step.rewards).astype(np.float64), np.nan)
+        returns[rollout_of_row] += discount * rewards[row_of_rollout]
+        discount *= agent.gamma
+
+        open_rows = step.valid & ~step.terminated
+        all_open = bool(open_rows.all())
+        if all_open:
+            observations = step.observations
+        else:
+            unfinished = open_rows[row_of_rollout]
+            rollout_of_row, row_of_rollout = rollout_of_row[unfinished], row_of_rollout[unfinished]
+            if not len(rollout_of_row):
+                break
+            observations = _take(step.observations, np.flatnonzero(open_rows))
+        # Simulations of one candidate share their first observation: the policy sees it once.
+        observation_of_rollout = (np.cumsum(open_rows) - 1)[row_of_rollout]
+        actions = agent.policy(observations)[observation_of_rollout]
+        actions = np.clip(actions + rollout_noise[depth, rollout_of_row], -1.0, 1.0)
+        if depth + 1 < depth_limit:
+            if not (all_open and len(row_of_rollout) == len(open_rows)):
+                model.select(row_of_rollout)
+            row_of_rollout = np.arange(len(rollout_of_row))
+        else:
+            last = agent.value(_take(observations, observation_of_rollout), actions)
+            returns[rollout_of_row] += discount * last.astype(np.float64)
+    return returns.reshape(n_envs, beam, n_sim), first_step, simulated_steps
+
+
+def _critic_values(observations: Observations, candidates: np.ndarray, agent: Agent) -> np.ndarray:
+    """Rank candidates by the critics alone: the paper's first evaluation step.
+
+    :return: ``[n_envs, beam]``.
+    """
+    n_envs, beam, act_dim = candidates.shape
+    repeated = _take(observations, np.repeat(np.arange(n_envs), beam))
+    values = agent.value(repeated, candidates.reshape(-1, act_dim))
+    return values.reshape(n_envs, beam).astype(np.float64)
+
+
+def _gaussian(rng: np.random.Generator, shape: tuple[int, ...], scale: float, clip: float | None) -> np.ndarray:
+    noise = rng.standard_normal(shape, dtype=np.float32)
+    noise *= np.float32(scale)
+    if clip is not None:
+        np.clip(noise, -clip, clip, out=noise)
+    return noise
+
+
+def _take(observations: Observations, index: np.ndarray | slice) -> Observations:
+    """Copy rows out of observations."""
+    if isinstance(observations, dict):
+        return {key: value[index].copy() for key, value in observations.items()}
+    return observations[index].copy()
+
+
+def _take_first_step(first_step: FirstStep, index: np.ndarray) -> FirstStep:
+    return FirstStep(_take(first_step.observations, index), first_step.rewards[index])

@@ -1,0 +1,26 @@
+"""Exact snapshots of environments."""
+
+from sb3_mcbs.snapshot.errors import SnapshotError, SnapshotMismatchError, SnapshotUnsupportedError
+from sb3_mcbs.snapshot.registry import SnapshotAdapter, register_adapter
+from sb3_mcbs.snapshot.replay import ReplayAdapter, uses_box2d
+from sb3_mcbs.snapshot.wrapper import Snapshot, SnapshotEnvWrapper
+
+register_adapter(uses_box2d, ReplayAdapter())
+try:
+    from sb3_mcbs.snapshot.mujoco import MjDataAdapter, MjModelAdapter, is_data, is_model
+except ImportError:  # MuJoCo is an optional part of Gymnasium
+    pass
+else:
+    register_adapter(is_model, MjModelAdapter())
+    register_adapter(is_data, MjDataAdapter())
+
+__all__ = [
+    "ReplayAdapter",
+    "Snapshot",
+    "SnapshotAdapter",
+    "SnapshotEnvWrapper",
+    "SnapshotError",
+    "SnapshotMismatchError",
+    "SnapshotUnsupportedError",
+    "register_adapter",
+]

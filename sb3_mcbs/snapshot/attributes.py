@@ -1,0 +1,74 @@
+"""The attributes of one layer: captured and put back."""
+
+from typing import Any
+
+from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
+from sb3_mcbs.snapshot.graph import ATOMIC_CLASSES, MISSING, Freezer, Ref, Thawer
+from sb3_mcbs.snapshot.kinds import kind_of
+from sb3_mcbs.snapshot.objects import set_attributes
+from sb3_mcbs.snapshot.randomness import thaw_np_random
+
+
+def freeze_attributes(
+    freezer: Freezer, env: Any, not_state: frozenset[str], skip_unsupported: bool
+) -> dict[str, Any]:
+    """Capture the attributes of a layer.
+
+    :param freezer: what captures them.
+    :param env: the wrapper or environment.
+    :param not_state: names of attributes to leave out.
+    :param skip_unsupported: leave out what cannot be captured instead of raising an error.
+    :return: the frozen value of each.
+    :raises SnapshotUnsupportedError: names the attribute.
+    """
+    attributes = {}
+    for name, value in vars(env).items():
+        if name in not_state:
+            continue
+        if type(value) in ATOMIC_CLASSES:
+            attributes[name] = value
+        elif skip_unsupported:
+            frozen = freezer.freeze_or_none(value)
+            if frozen is not None:
+                attributes[name] = frozen[0]
+        else:
+            try:
+                attributes[name] = freezer.freeze(value)
+            except SnapshotUnsupportedError as error:
+                error.path.insert(0, f"{type(env).__name__}.{name}")
+                raise
+    return attributes
+
+
+def thaw_attributes(
+    thawer: Thawer, env: Any, not_state: frozenset[str], attributes: dict[str, Any], delete_others: bool
+) -> None:
+    """Plan to put back the attributes of a layer.
+
+    :param thawer: keeps the plan.
+    :param env: the wrapper or environment.
+    :param not_state: names of attributes that are left alone.
+    :param attributes: captured attributes.
+    :param delete_others: whether attributes that were not there are deleted.
+    """
+    have = vars(env)
+    values = dict(attributes)
+    for name, value in attributes.items():
+        if name == "_np_random":
+            del values[name]
+            thaw_np_random(thawer, env, value, have)
+        elif type(value) is Ref:
+            values[name] = thawer.thaw(value, have.get(name, MISSING))
+            if values[name] is MISSING:
+                del values[name]
+    gone = set()
+    if delete_others:
+        for name in have:
+            if name not in attributes and name not in not_state and not _is_drawn(have[name]):
+                gone.add(name)
+    thawer.do_then(set_attributes, env, values, gone)
+
+
+def _is_drawn(value: Any) -> bool:
+    kind = kind_of(value)
+    return kind is not None and kind.name in ("constant", "window")

@@ -1,0 +1,238 @@
+"""Ordinary state as a graph: frozen into plain values, put back, copied.
+
+An environment's attributes form a graph: wrappers refer to each other, arrays are shared, functions
+close over objects. The three classes here walk it, each with a memo, so that what was shared stays
+shared. What is done with one object is decided by its kind (:mod:`sb3_mcbs.snapshot.kinds`).
+"""
+
+import copy as copy_module
+import re
+import types
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import numpy as np
+
+from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
+
+#: Stands for "there is nothing at this place".
+MISSING: Any = type("Missing", (), {"__repr__": lambda self: "MISSING"})()
+
+#: Classes whose objects never change.
+ATOMIC_CLASSES: frozenset[type] = frozenset(
+    {type(None), bool, int, float, complex, str, bytes, range, slice, type(Ellipsis), type(NotImplemented)}
+    | {re.Pattern, types.GenericAlias, property, np.ufunc}
+    | {np.bool_, np.float64, np.float32, np.int64, np.int32, np.uint8}
+)
+
+#: What a restore does with random generators.
+RngMode = str | np.random.Generator
+
+
+def class_name(cls: type) -> str:
+    """Name a class with its module.
+
+    :param cls: the class.
+    """
+    # Some compiled classes have no module.
+    return f"{getattr(cls, '__module__', None)}.{cls.__qualname__}"
+
+
+class Ref:
+    """A frozen value that stands for the node with this number."""
+
+    __slots__ = ("index",)
+
+    def __init__(self, index: int) -> None:
+        self.index = index
+
+    def __reduce__(self) -> tuple[type, tuple[int]]:
+        return Ref, (self.index,)
+
+
+class Kind(Protocol):
+    """What is done with the objects of one kind."""
+
+    name: str
+
+    def freeze(self, freezer: "Freezer", obj: Any) -> Any:
+        """Return the object's content as plain values and references to nodes."""
+
+    def thaw(self, thawer: "Thawer", index: int, payload: Any, current: Any) -> Any:
+        """Return the object for a frozen content; ``current`` is what is at its place now."""
+
+    def copy(self, copier: "Copier", obj: Any) -> Any:
+        """Return an independent copy and enter it in the copier's memo."""
+
+
+Node = tuple[str, Any]
+
+
+class Freezer:
+    """Turns values into frozen values and nodes.
+
+    :param kind_of: the kind of an object; None for objects that never change and stand for themselves.
+    :param known: id of an object -> the node it is, for objects that are named rather than captured.
+    :param n_known: how many nodes those are, the first ones.
+    """
+
+    def __init__(self, kind_of: Callable[[Any], Kind | None], known: dict[int, Ref], n_known: int) -> None:
+        self.nodes: list[Node] = [("known", None)] * n_known
+        self._kind_of = kind_of
+        self._memo = dict(known)
+        # An id is only unique among objects that live, and some objects on the way are temporary.
+        self._alive: list[Any] = []
+
+    def freeze(self, value: Any) -> Any:
+        """Return a frozen value.
+
+        :param value: any value that an environment holds.
+        :raises SnapshotUnsupportedError: if part of it cannot be captured.
+        """
+        if type(value) in ATOMIC_CLASSES or (kind := self._kind_of(value)) is None:
+            return value
+        ref = self._memo.get(id(value))
+        if ref is not None:
+            return ref
+        ref = self._memo[id(value)] = Ref(len(self.nodes))
+        self.nodes.append(("pending", None))
+        self._alive.append(value)
+        self.nodes[ref.index] = (kind.name, kind.freeze(self, value))
+        return ref
+
+    def freeze_or_none(self, value: Any) -> tuple[Any] | None:
+        """Return a frozen value in a tuple, or None where :meth:`freeze` would raise.
+
+        :param value: any value that an environment holds.
+        """
+        n_nodes, n_alive = len(self.nodes), len(self._alive)
+        try:
+            return (self.freeze(value),)
+        except SnapshotUnsupportedError:
+            for obj in self._alive[n_alive:]:
+                self._memo.pop(id(obj), None)
+            del self.nodes[n_nodes:]
+            del self._alive[n_alive:]
+            return None
+
+
+class Thawer:
+    """Turns frozen values back into objects, without changing anything until :meth:`commit`.
+
+    :param nodes: the nodes that the frozen values refer to.
+    :param kinds: kinds by name.
+    :param known: the objects that stand for the first nodes, in order.
+    :param rng: what happens to random generators: "restore", "keep", or a generator to seed them from.
+    """
+
+    def __init__(
+        self, nodes: tuple[Node, ...], kinds: dict[str, Kind], known: list[Any], rng: RngMode
+    ) -> None:
+        self.rng = rng
+        self.memo: dict[int, Any] = dict(enumerate(known))
+        self._nodes = nodes
+        self._kinds = kinds
+        self._claimed: set[int] = {id(obj) for obj in known}
+        self._first: list[tuple[Any, ...]] = []
+        self._then: list[tuple[Any, ...]] = []
+
+    def thaw(self, value: Any, current: Any = MISSING) -> Any:
+        """Return the object for a frozen value.
+
+        :param value: a frozen value.
+        :param current: what is at its place now, if anything.
+        :raises SnapshotMismatchError: if the snapshot cannot have come from here.
+        """
+        if type(value) is not Ref:
+            return value
+        index = value.index
+        if index in self.memo:
+            return self.memo[index]
+        name, payload = self._nodes[index]
+        thawed = self.memo[index] = self._kinds[name].thaw(self, index, payload, current)
+        return thawed
+
+    def claim(self, obj: Any) -> bool:
+        """Return whether an object may stand for one more node, and note that it now does.
+
+        :param obj: an object that is there already.
+        """
+        if obj is MISSING or id(obj) in self._claimed:
+            return False
+        self._claimed.add(id(obj))
+        return True
+
+    def do_first(self, *call: Any) -> None:
+        """Plan a call that puts back a simulator: these run before attributes are set.
+
+        :param call: the function and its arguments.
+        """
+        self._first.append(call)
+
+    def do_then(self, *call: Any) -> None:
+        """Plan a call that changes an object.
+
+        :param call: the function and its arguments.
+        """
+        self._then.append(call)
+
+    def commit(self) -> None:
+        """Make the planned calls."""
+        for function, *arguments in self._first:
+            function(*arguments)
+        for function, *arguments in self._then:
+            function(*arguments)
+
+
+class Copier:
+    """Copies values, keeping what is shared among them shared among the copies.
+
+    :param kind_of: the kind of an object; None for objects that never change.
+    :param known: id of an object -> what stands in its place in the copy.
+    """
+
+    def __init__(self, kind_of: Callable[[Any], Kind | None], known: dict[int, Any]) -> None:
+        self.memo = known
+        self.adapted: list[tuple[Any, Any, Any]] = []
+        self._kind_of = kind_of
+        self._alive: list[Any] = []
+
+    def copy(self, value: Any) -> Any:
+        """Return the copy of a value.
+
+        :param value: any value that an environment holds.
+        :raises SnapshotUnsupportedError: if part of it cannot be copied.
+        """
+        if type(value) in ATOMIC_CLASSES or (kind := self._kind_of(value)) is None:
+            return value
+        key = id(value)
+        if key not in self.memo:
+            self._alive.append(value)
+            # The kind enters it in the memo as well if the object can refer to itself.
+            self.memo[key] = kind.copy(self, value)
+        return self.memo[key]
+
+    def enter(self, value: Any, copy: Any) -> Any:
+        """Note the copy of an object before its content is copied.
+
+        :param value: the object.
+        :param copy: its copy, still empty.
+        :return: ``copy``.
+        """
+        self._alive.append(value)
+        self.memo[id(value)] = copy
+        return copy
+
+
+def private_copy(obj: Any) -> Any:
+    """Copy an observation so that later in-place edits do not reach it.
+
+    :param obj: an observation: an array, or dicts and tuples of arrays, or a plain value.
+    """
+    if isinstance(obj, np.ndarray):
+        return obj.copy()
+    if isinstance(obj, dict):
+        return {key: private_copy(value) for key, value in obj.items()}
+    if isinstance(obj, tuple):
+        return tuple(private_copy(value) for value in obj)
+    return obj if type(obj) in ATOMIC_CLASSES or isinstance(obj, np.generic) else copy_module.deepcopy(obj)

@@ -1,0 +1,174 @@
+"""The kinds of objects that environments hold, and how each is frozen, thawed and copied."""
+
+import enum
+import logging
+import pathlib
+import types
+from collections import deque
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec, WrapperSpec
+
+from sb3_mcbs.snapshot import generators
+from sb3_mcbs.snapshot.arrays import ArrayKind
+from sb3_mcbs.snapshot.containers import DictKind, SequenceKind
+from sb3_mcbs.snapshot.errors import SnapshotMismatchError
+from sb3_mcbs.snapshot.functions import BuiltinMethodKind, CellKind, FunctionKind, MethodKind
+from sb3_mcbs.snapshot.graph import ATOMIC_CLASSES, MISSING, Copier, Freezer, Kind, Thawer, class_name
+from sb3_mcbs.snapshot.objects import ObjectKind, ReducedKind, is_ordinary
+from sb3_mcbs.snapshot.randomness import GeneratorKind, SpaceKind
+from sb3_mcbs.snapshot.registry import SnapshotAdapter, call_on_change, find_adapter
+
+#: Parts of packages that draw: what they hold is not state of the environment.
+_DRAWING = (
+    "pygame",
+    "glfw",
+    "OpenGL",
+    "pyglet",
+    "mujoco.renderer",
+    "mujoco.viewer",
+    "gymnasium.envs.mujoco.mujoco_rendering",
+    "gymnasium.envs.classic_control.rendering",
+)
+
+_ATOMIC_BASES = (type, np.generic, np.dtype, enum.Enum, pathlib.PurePath)
+_EXACT: dict[type, str] = {
+    np.ndarray: "array",
+    list: "sequence",
+    tuple: "sequence",
+    set: "sequence",
+    frozenset: "sequence",
+    deque: "sequence",
+    dict: "dict",
+    types.FunctionType: "function",
+    types.CellType: "cell",
+    types.MethodType: "method",
+    types.BuiltinMethodType: "builtin",
+}
+_CONSTANT_BASES = (types.ModuleType, EnvSpec, WrapperSpec, logging.Logger, logging.LoggerAdapter)
+
+
+class ConstantKind:
+    """Objects that are not state: whatever is there stays, and a copy refers to the same."""
+
+    name = "constant"
+
+    def freeze(self, freezer: Freezer, obj: Any) -> Any:
+        return None
+
+    def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
+        return current
+
+    def copy(self, copier: Copier, obj: Any) -> Any:
+        return obj
+
+
+class WindowKind(ConstantKind):
+    """Windows and render contexts: whatever is there stays, and a copy has none."""
+
+    name = "window"
+
+    def copy(self, copier: Copier, obj: Any) -> Any:
+        return None
+
+
+class AdapterKind:
+    """Objects for which an adapter is registered."""
+
+    name = "adapter"
+
+    def freeze(self, freezer: Freezer, obj: Any) -> Any:
+        adapter = find_adapter(obj)
+        assert adapter is not None
+        return class_name(type(obj)), adapter.capture(obj)
+
+    def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
+        cls, state = payload
+        if current is MISSING or class_name(type(current)) != cls:
+            here = "nothing" if current is MISSING else f"a {class_name(type(current))}"
+            raise SnapshotMismatchError(
+                f"The snapshot holds the state of a {cls}, and this environment has {here} there."
+            )
+        plan_adapter(thawer, find_adapter(current), current, state)
+        return current
+
+    def copy(self, copier: Copier, obj: Any) -> Any:
+        adapter = find_adapter(obj)
+        assert adapter is not None
+        made = adapter.clone(obj, copier.copy)
+        copier.adapted.append((adapter, obj, made))
+        return made
+
+
+def plan_adapter(thawer: Thawer, adapter: SnapshotAdapter | None, obj: Any, state: Any) -> None:
+    """Check a state that an adapter captured and plan to put it back.
+
+    :param thawer: keeps the plan.
+    :param adapter: the adapter for ``obj``.
+    :param obj: the object to restore.
+    :param state: what the adapter captured.
+    :raises SnapshotMismatchError: if the state does not belong to the object.
+    """
+    if adapter is None:
+        raise SnapshotMismatchError(
+            f"The snapshot needs an adapter for {class_name(type(obj))}, and none is registered here."
+        )
+    adapter.validate(obj, state)
+    thawer.do_first(adapter.restore, obj, state)
+    if isinstance(thawer.rng, np.random.Generator):
+        rng = thawer.rng
+        thawer.do_first(lambda: adapter.reseed(obj, int(rng.integers(2**63))))
+
+
+#: Kinds by name, as nodes name them.
+KINDS: dict[str, Kind] = {}
+for _kind_class in (
+    ConstantKind, WindowKind, ArrayKind, SequenceKind, DictKind, GeneratorKind, SpaceKind, ObjectKind, ReducedKind,
+    AdapterKind, FunctionKind, CellKind, MethodKind, BuiltinMethodKind,
+):  # fmt: skip
+    KINDS[_kind_class.name] = _kind_class()
+
+_kind_by_class: dict[type, Kind | None] = dict.fromkeys(ATOMIC_CLASSES)
+
+
+def _forget() -> None:
+    _kind_by_class.clear()
+    _kind_by_class.update(dict.fromkeys(ATOMIC_CLASSES))
+
+
+call_on_change(_forget)
+
+
+def kind_of(obj: Any) -> Kind | None:
+    """Return the kind of an object; None if it never changes.
+
+    :param obj: any object that an environment holds.
+    """
+    cls = type(obj)
+    try:
+        return _kind_by_class[cls]
+    except KeyError:
+        kind = _kind_by_class[cls] = _decide(obj, cls)
+        return kind
+
+
+def _decide(obj: Any, cls: type) -> Kind | None:
+    if issubclass(cls, _ATOMIC_BASES) and not issubclass(cls, np.void):
+        return None
+    if find_adapter(obj) is not None:
+        return KINDS["adapter"]
+    for known, name in _EXACT.items():
+        if cls is known:
+            return KINDS[name]
+    if issubclass(cls, _CONSTANT_BASES):
+        return KINDS["constant"]
+    name = class_name(cls)
+    if any(name.startswith(part + ".") for part in _DRAWING):
+        return KINDS["window"]
+    if generators.is_generator(obj):
+        return KINDS["generator"]
+    if issubclass(cls, spaces.Space):
+        return KINDS["space"]
+    return KINDS["object" if is_ordinary(cls) else "reduced"]

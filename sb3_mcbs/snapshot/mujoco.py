@@ -1,0 +1,318 @@
+"""MuJoCo: models and data, whole and exact.
+
+MuJoCo's own state vector leaves out what some environments read, such as ``xpos`` and ``cfrc_ext``,
+which lag the state by one substep. So a snapshot holds a full ``MjData``, and besides the values of the
+model, which environments may edit.
+"""
+
+import ctypes
+import operator
+import weakref
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from sb3_mcbs.snapshot.errors import SnapshotMismatchError
+from sb3_mcbs.snapshot.registry import SnapshotAdapter
+
+#: Textures are most of a model's bytes, and only drawing reads them.
+_LEFT_OUT = ("tex_data",)
+_ALIGNMENT = 64
+_MAX_SPARES = 128
+_MAX_SPARE_MODELS = 16
+
+
+class _ModelLayout:
+    """Where the values of one ``MjModel`` lie in memory, as few long blocks.
+
+    :param model: the model. The blocks are only valid while it lives.
+    """
+
+    def __init__(self, model: Any) -> None:
+        arrays = {
+            name: array for name in _public(model) if isinstance(array := getattr(model, name), np.ndarray)
+        }
+        self.sizes = {
+            name: value for name in _public(model) if type(value := getattr(model, name, None)) is int
+        }
+        self.names = bytes(model.names)
+        self.blocks = _blocks(
+            [array for name, array in arrays.items() if name not in _LEFT_OUT], arrays, model.nbuffer
+        )
+        # Their values are read for every snapshot; comparing MuJoCo's structures takes 100 times as long.
+        self.structures: list[tuple[Any, list[str], Callable[[Any], Any], list[np.ndarray]]] = []
+        for structure in (model.opt, model.stat):
+            values = {name: getattr(structure, name) for name in _public(structure)}
+            scalars = [name for name, value in values.items() if isinstance(value, int | float)]
+            views = [value for value in values.values() if isinstance(value, np.ndarray)]
+            self.structures.append((structure, scalars, operator.attrgetter(*scalars), views))
+        self.last: ModelState | None = None
+
+    def read_blocks(self) -> list[bytes]:
+        """Read the values of all arrays."""
+        return [block.tobytes() for block in self.blocks]
+
+    def read_structures(self) -> tuple[Any, ...]:
+        """Read the options and statistics."""
+        return tuple(
+            (read(structure), tuple(view.tobytes() for view in views))
+            for structure, _, read, views in self.structures
+        )
+
+
+def _public(obj: Any) -> list[str]:
+    return [name for name in dir(type(obj)) if not name.startswith("_")]
+
+
+def _address(array: np.ndarray) -> int:
+    return int(array.__array_interface__["data"][0])
+
+
+def _blocks(wanted: list[np.ndarray], arrays: dict[str, np.ndarray], n_buffer: int) -> list[np.ndarray]:
+    """Cover arrays that lie in one buffer by few views of bytes."""
+    spans = sorted((_address(array), _address(array) + array.nbytes) for array in wanted if array.nbytes)
+    ends = [(_address(array), _address(array) + array.nbytes) for array in arrays.values() if array.nbytes]
+    one_buffer = max(end for _, end in ends) - min(start for start, _ in ends) <= n_buffer
+    merged: list[list[int]] = []
+    for start, end in spans:
+        if merged and one_buffer and start - merged[-1][1] < _ALIGNMENT:
+            merged[-1][1] = max(end, merged[-1][1])
+        else:
+            merged.append([start, end])
+    return [
+        np.ctypeslib.as_array((ctypes.c_uint8 * (end - start)).from_address(start)) for start, end in merged
+    ]
+
+
+class ModelState:
+    """The values of an ``MjModel``: everything but textures and what only concerns drawing.
+
+    :param layout: of the model to read.
+    """
+
+    def __init__(self, layout: _ModelLayout) -> None:
+        self.sizes = layout.sizes
+        self.names = layout.names
+        self.blocks = layout.read_blocks()
+        self.structures = layout.read_structures()
+
+    def is_in(self, layout: _ModelLayout) -> bool:
+        """Return whether a model has exactly these values.
+
+        :param layout: of a model of the same sizes.
+        """
+        return self.structures == layout.read_structures() and self.blocks == layout.read_blocks()
+
+    def write(self, layout: _ModelLayout) -> None:
+        """Give a model these values.
+
+        :param layout: of a model of the same sizes.
+        """
+        for mine, its in zip(self.blocks, layout.blocks, strict=True):
+            its[:] = np.frombuffer(mine, np.uint8)
+        for (structure, names, _, views), (scalars, contents) in zip(
+            layout.structures, self.structures, strict=True
+        ):
+            for name, value in zip(names, scalars, strict=True):
+                setattr(structure, name, value)
+            for view, content in zip(views, contents, strict=True):
+                view.reshape(-1)[:] = np.frombuffer(content, view.dtype)
+
+
+_layouts: dict[int, tuple[Any, _ModelLayout]] = {}
+
+
+def _layout(model: Any) -> _ModelLayout:
+    """Return the layout of a model, found once in its life."""
+    known = _layouts.get(id(model))
+    if known is not None and known[0]() is model:
+        return known[1]
+    key = id(model)
+    layout = _ModelLayout(model)
+    _layouts[key] = (weakref.ref(model, lambda _: _layouts.pop(key, None)), layout)
+    return layout
+
+
+def _check_same_model(sizes: dict[str, int], names: bytes, layout: _ModelLayout) -> None:
+    """Refuse a state of another model, naming what differs."""
+    for name, value in sizes.items():
+        if layout.sizes.get(name) != value:
+            raise SnapshotMismatchError(
+                f"The snapshot is of another MuJoCo model: {name} is {value} in it and "
+                f"{layout.sizes.get(name)} in this environment."
+            )
+    if names != layout.names:
+        theirs, ours = (set(packed.decode(errors="replace").split("\0")) for packed in (names, layout.names))
+        raise SnapshotMismatchError(
+            "The snapshot is of another MuJoCo model: names such as "
+            f"{sorted(theirs - ours)[:3]} are only in it, and {sorted(ours - theirs)[:3]} only in this one."
+        )
+
+
+def is_model(obj: Any) -> bool:
+    """Return whether an object is an ``MjModel``.
+
+    :param obj: any object.
+    """
+    return isinstance(obj, mujoco.MjModel)
+
+
+def is_data(obj: Any) -> bool:
+    """Return whether an object is an ``MjData``.
+
+    :param obj: any object.
+    """
+    return isinstance(obj, mujoco.MjData)
+
+
+class MjModelAdapter(SnapshotAdapter):
+    """Captures the values of a model; snapshots share them for as long as nobody edits the model."""
+
+    def capture(self, obj: Any) -> ModelState:
+        layout = _layout(obj)
+        if layout.last is None or not layout.last.is_in(layout):
+            layout.last = ModelState(layout)
+        return layout.last
+
+    def restore(self, obj: Any, state: ModelState) -> None:
+        layout = _layout(obj)
+        if not state.is_in(layout):
+            state.write(layout)
+            layout.last = state
+
+    def validate(self, obj: Any, state: ModelState) -> None:
+        layout = _layout(obj)
+        if state.sizes is not layout.sizes:
+            _check_same_model(state.sizes, state.names, layout)
+
+    def clone(self, obj: Any, copy: Callable[[Any], Any]) -> Any:
+        return obj.__copy__()
+
+    def clone_view(self, obj: Any, new: Any, array: np.ndarray) -> np.ndarray | None:
+        return _counterpart(obj, new, array)
+
+
+# Making an MjData takes 100 times as long as copying into one, so those of dropped snapshots are used again.
+_spares: OrderedDict[tuple[int, ...], list[Any]] = OrderedDict()
+
+
+def _spares_for(sizes: tuple[int, ...]) -> list[Any]:
+    spares = _spares.get(sizes)
+    if spares is None:
+        spares = _spares[sizes] = []
+        while len(_spares) > _MAX_SPARE_MODELS:
+            _spares.popitem(last=False)
+    return spares
+
+
+# Fields of MjData that MuJoCo's own pickling forgets.
+_NOT_PICKLED = ("flg_rnepost", "nl", "solver_niter", "solver_nnz")
+
+
+class DataState:
+    """A private ``MjData`` that holds a state.
+
+    :param data: what to copy.
+    :param model: the model that ``data`` was made for.
+    """
+
+    def __init__(self, data: Any, model: Any) -> None:
+        layout = _layout(model)
+        self.sizes = layout.sizes
+        self.names = layout.names
+        self._spares = _spares_for(tuple(layout.sizes.values()))
+        try:
+            self._data = self._spares.pop()
+        except IndexError:
+            self._data = mujoco.MjData(model)
+        self._pickled: dict[str, Any] | None = None
+        mujoco.mj_copyData(self._data, model, data)
+
+    def write(self, data: Any, model: Any) -> None:
+        """Copy the state into an ``MjData``.
+
+        :param data: where to.
+        :param model: the model that ``data`` was made for.
+        """
+        if self._pickled is not None:
+            self._data, self._pickled = _unpickled(self._pickled, model), None
+        mujoco.mj_copyData(data, model, self._data)
+
+    def __del__(self) -> None:
+        data = getattr(self, "_data", None)
+        if data is not None and len(self._spares) < _MAX_SPARES:
+            self._spares.append(data)
+
+    def __getstate__(self) -> dict[str, Any]:
+        pickled = self._pickled or _pickled(self._data)
+        return {"sizes": self.sizes, "names": self.names, "_pickled": pickled}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, _data=None, _spares=_spares_for(tuple(state["sizes"].values())))
+
+
+def _pickled(data: Any) -> dict[str, Any]:
+    """Return what a pickle holds of an ``MjData``."""
+    content, model = data.__getstate__(), data.model.__getstate__()
+    # MuJoCo puts the whole model in front, which whoever restores the state has already.
+    start = content.find(model)
+    cut = start >= 0
+    parts = (content[:start], content[start + len(model) :]) if cut else (content,)
+    kept = {name: getattr(data, name) for name in _NOT_PICKLED if hasattr(data, name)}
+    return {
+        "parts": parts,
+        "kept": {n: np.array(v) if isinstance(v, np.ndarray) else v for n, v in kept.items()},
+    }
+
+
+def _unpickled(pickled: dict[str, Any], model: Any) -> Any:
+    """Make the ``MjData`` that :func:`_pickled` was given."""
+    parts = pickled["parts"]
+    content = parts[0] if len(parts) == 1 else parts[0] + model.__getstate__() + parts[1]
+    data = mujoco.MjData.__new__(mujoco.MjData)
+    data.__setstate__(content)
+    for name, value in pickled["kept"].items():
+        if isinstance(value, np.ndarray):
+            getattr(data, name)[...] = value
+        else:
+            setattr(data, name, value)
+    return data
+
+
+class MjDataAdapter(SnapshotAdapter):
+    """Captures a whole ``MjData``."""
+
+    def capture(self, obj: Any) -> DataState:
+        return DataState(obj, obj.model)
+
+    def restore(self, obj: Any, state: DataState) -> None:
+        state.write(obj, obj.model)
+
+    def validate(self, obj: Any, state: DataState) -> None:
+        layout = _layout(obj.model)
+        if state.sizes is not layout.sizes:
+            _check_same_model(state.sizes, state.names, layout)
+
+    def clone(self, obj: Any, copy: Callable[[Any], Any]) -> Any:
+        model = copy(obj.model)
+        data = mujoco.MjData(model)
+        mujoco.mj_copyData(data, model, obj)
+        return data
+
+    def clone_view(self, obj: Any, new: Any, array: np.ndarray) -> np.ndarray | None:
+        return _counterpart(obj, new, array)
+
+
+def _counterpart(obj: Any, new: Any, array: np.ndarray) -> np.ndarray | None:
+    """Find the view into ``new`` that lies where ``array`` lies in ``obj``."""
+    for name in _public(obj):
+        field = getattr(obj, name)
+        if not isinstance(field, np.ndarray) or not np.may_share_memory(field, array):
+            continue
+        memory = getattr(new, name).reshape(-1).view(np.uint8)
+        offset = _address(array) - _address(field)
+        return np.ndarray(array.shape, array.dtype, memory, offset, array.strides)
+    return None

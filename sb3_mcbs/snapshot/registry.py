@@ -1,0 +1,127 @@
+"""Adapters: how objects that are not ordinary Python state are captured."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import Any
+
+
+class SnapshotAdapter(ABC):
+    """How one kind of object inside an environment is captured, put back and copied.
+
+    The object may be a simulator that an environment holds in an attribute, or the environment (or
+    a wrapper) itself.
+
+    :cvar with_attributes: for an adapter of whole environments or wrappers: whether their Python
+        attributes are captured besides what :meth:`capture` returns. They are put back after
+        :meth:`restore` has run; attributes that cannot be captured are then the adapter's business.
+    """
+
+    with_attributes: bool = False
+
+    def attach(self, env: Any) -> None:  # noqa: B027
+        """Prepare an environment; called when it is wrapped in ``SnapshotEnvWrapper``.
+
+        Only called for environments and wrappers, not for the objects that they hold.
+
+        :param env: the environment or wrapper.
+        :raises SnapshotUnsupportedError: if it cannot be captured after all.
+        """
+
+    @abstractmethod
+    def capture(self, obj: Any) -> Any:
+        """Read the present state.
+
+        :param obj: the object.
+        :return: the state: picklable, and never changed by what happens to the object later.
+        """
+
+    @abstractmethod
+    def restore(self, obj: Any, state: Any) -> None:
+        """Put an object into a captured state, in place.
+
+        :param obj: the object, or its counterpart in another instance of the environment.
+        :param state: what :meth:`capture` returned. It must not be altered: it may be restored again.
+        """
+
+    @abstractmethod
+    def clone(self, obj: Any, copy: Callable[[Any], Any]) -> Any:
+        """Make an independent object in the same state.
+
+        :param obj: the object.
+        :param copy: returns the copy of another object of the same environment, for objects that
+            refer to each other.
+        :return: the new object.
+        """
+
+    def validate(self, obj: Any, state: Any) -> None:  # noqa: B027
+        """Refuse a state that does not belong to an object; called before anything is changed.
+
+        :param obj: the object that would be restored.
+        :param state: what :meth:`capture` returned.
+        :raises SnapshotMismatchError: names the difference.
+        """
+
+    def reseed(self, obj: Any, seed: int) -> None:  # noqa: B027
+        """Seed the object's own random generator afresh, if it has one.
+
+        Called after :meth:`restore` when the environment is restored with a generator to draw from.
+
+        :param obj: the object.
+        :param seed: non-negative, below 2**63.
+        """
+
+    def clone_view(self, obj: Any, new: Any, array: Any) -> Any:
+        """Find in a cloned object the array that corresponds to a view into the original.
+
+        :param obj: the original.
+        :param new: its clone.
+        :param array: an array whose memory belongs to something that is not an array.
+        :return: the corresponding view into ``new``, or None if the memory is not the object's.
+        """
+        return None
+
+
+Predicate = Callable[[Any], bool]
+
+_registered: list[tuple[Predicate, SnapshotAdapter]] = []
+_by_class: dict[type, SnapshotAdapter | None] = {}
+_on_change: list[Callable[[], None]] = []
+
+
+def register_adapter(predicate: Predicate, adapter: SnapshotAdapter) -> None:
+    """Say how objects of some kind are captured.
+
+    The adapter that was registered last is asked first. A predicate is asked once per class, with
+    the first object of that class that is met, and its answer is remembered.
+
+    :param predicate: given an environment, a wrapper or an object that one of them holds, whether
+        ``adapter`` is the one for it.
+    :param adapter: what captures it.
+    """
+    if not callable(predicate):
+        raise TypeError(f"The predicate must be callable, got {predicate!r}")
+    if not isinstance(adapter, SnapshotAdapter):
+        raise TypeError(f"The adapter must be an instance of a SnapshotAdapter subclass, got {adapter!r}")
+    _registered.insert(0, (predicate, adapter))
+    _by_class.clear()
+    for forget in _on_change:
+        forget()
+
+
+def find_adapter(obj: Any) -> SnapshotAdapter | None:
+    """Return the adapter for an object, or None if there is none.
+
+    :param obj: an environment, a wrapper or an object that one of them holds.
+    """
+    cls = type(obj)
+    if cls not in _by_class:
+        _by_class[cls] = next((adapter for predicate, adapter in _registered if predicate(obj)), None)
+    return _by_class[cls]
+
+
+def call_on_change(forget: Callable[[], None]) -> None:
+    """Have a function called whenever an adapter is registered.
+
+    :param forget: drops what was derived from the registered adapters.
+    """
+    _on_change.append(forget)

@@ -1,0 +1,202 @@
+"""Snapshots by replay, for simulators that cannot be copied (Box2D)."""
+
+import inspect
+import time
+import warnings
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from sb3_mcbs.snapshot.attributes import freeze_attributes, thaw_attributes
+from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
+from sb3_mcbs.snapshot.graph import Freezer, Node, Ref, Thawer, private_copy
+from sb3_mcbs.snapshot.kinds import KINDS, kind_of
+from sb3_mcbs.snapshot.layers import NOT_STATE
+from sb3_mcbs.snapshot.registry import SnapshotAdapter
+
+
+class Episode(NamedTuple):
+    """What has to be replayed.
+
+    :param attributes: attributes of the environment just before its reset, generators included.
+    :param nodes: the nodes that ``attributes`` refers to.
+    :param reset: keyword arguments of the reset.
+    :param actions: what the environment was stepped with since.
+    """
+
+    attributes: dict[str, Any]
+    nodes: tuple[Node, ...]
+    reset: dict[str, Any]
+    actions: tuple[Any, ...]
+
+
+class Recorder:
+    """Stands in for the ``reset`` and ``step`` of one environment and records the episode.
+
+    It is put on the environment itself, below every wrapper, so that it also sees what does not
+    come through a ``SnapshotEnvWrapper``.
+
+    :param env: the environment.
+    """
+
+    def __init__(self, env: Any) -> None:
+        self.env = env
+        self.episode: Episode | None = None
+        self.actions: list[Any] = []
+        self._reset = env.reset
+        self._step = env.step
+        env.reset = self.reset
+        env.step = self.step
+
+    def reset(self, **arguments: Any) -> Any:
+        """Reset the environment and begin a record.
+
+        :param arguments: of the environment's ``reset``.
+        :return: what the environment returns.
+        """
+        self.begin(arguments)
+        return self._reset(**arguments)
+
+    def step(self, action: Any) -> Any:
+        """Step the environment and record the action.
+
+        :param action: of the environment's ``step``.
+        :return: what the environment returns.
+        """
+        self.actions.append(private_copy(action))
+        return self._step(action)
+
+    def begin(self, arguments: dict[str, Any]) -> None:
+        """Begin a record.
+
+        :param arguments: of the reset that follows.
+        """
+        freezer = Freezer(kind_of, {id(self.env): Ref(0)}, 1)
+        attributes = freeze_attributes(freezer, self.env, _NOT_STATE, skip_unsupported=True)
+        self.episode = Episode(attributes, tuple(freezer.nodes), private_copy(arguments), ())
+        self.actions = []
+
+    def replay(self, episode: Episode) -> None:
+        """Repeat an episode on the environment.
+
+        :param episode: what to repeat.
+        """
+        thawer = Thawer(episode.nodes, KINDS, [self.env], "restore")
+        thaw_attributes(thawer, self.env, _NOT_STATE, episode.attributes, delete_others=False)
+        thawer.commit()
+        render_mode, self.env.render_mode = self.env.render_mode, None
+        try:
+            self._reset(**private_copy(episode.reset))
+            for action in episode.actions:
+                self._step(private_copy(action))
+        finally:
+            self.env.render_mode = render_mode
+        self.episode = episode._replace(actions=())
+        self.actions = list(episode.actions)
+
+
+_NOT_STATE = NOT_STATE | {"reset", "step"}
+
+
+class ReplayAdapter(SnapshotAdapter):
+    """Restores an environment by repeating its episode from the reset on.
+
+    For environments whose simulator cannot be copied and that always do the same when they start
+    from the same random state and get the same actions. Exact, but a restore costs as much as
+    all steps of the episode so far; the first one says so.
+
+    The environment's Python attributes are put back afterwards, where they can be captured. What is
+    done to the simulator other than through the environment's ``reset`` and ``step`` is not repeated.
+    """
+
+    with_attributes = True
+
+    def __init__(self) -> None:
+        self._told: set[type] = set()
+
+    def attach(self, env: Any) -> None:
+        if _recorder(env) is None:
+            _constructor_arguments(env)
+            Recorder(env)
+
+    def capture(self, obj: Any) -> Episode | None:
+        recorder = _recorder(obj)
+        assert recorder is not None, "attach() comes before capture()"
+        if recorder.episode is None:
+            return None
+        return recorder.episode._replace(actions=tuple(recorder.actions))
+
+    def restore(self, obj: Any, state: Episode | None) -> None:
+        recorder = _recorder(obj)
+        assert recorder is not None, "attach() comes before restore()"
+        if state is None:
+            recorder.episode, recorder.actions = None, []
+            return
+        start = time.perf_counter()
+        recorder.replay(state)
+        self._tell(obj, len(state.actions), time.perf_counter() - start)
+
+    def clone(self, obj: Any, copy: Callable[[Any], Any]) -> Any:
+        made = type(obj)(**_constructor_arguments(obj))
+        made.spec = obj.spec
+        made.render_mode = None
+        return made
+
+    def _tell(self, env: Any, n_steps: int, seconds: float) -> None:
+        if type(env) in self._told:
+            return
+        self._told.add(type(env))
+        warnings.warn(
+            f"The simulator of {type(env).__name__} cannot be copied, so its snapshots are restored by repeating "
+            f"the episode: this restore took {1e3 * seconds:.2f} ms for {n_steps} steps, and later in an episode "
+            "it takes longer.",
+            stacklevel=2,
+        )
+
+
+def _recorder(env: Any) -> Recorder | None:
+    owner = getattr(vars(env).get("step"), "__self__", None)
+    return owner if isinstance(owner, Recorder) else None
+
+
+def _constructor_arguments(env: Any) -> dict[str, Any]:
+    """Find the arguments that make another environment like this one, which draws nothing.
+
+    :raises SnapshotUnsupportedError: if they cannot be found out.
+    """
+    parameters = inspect.signature(type(env)).parameters
+    if hasattr(env, "_ezpickle_args"):
+        bound = inspect.signature(type(env)).bind(*env._ezpickle_args, **env._ezpickle_kwargs)
+        arguments: dict[str, Any] = {}
+        for name, value in bound.arguments.items():
+            if parameters[name].kind is inspect.Parameter.VAR_KEYWORD:
+                arguments.update(value)
+            elif parameters[name].kind is not inspect.Parameter.VAR_POSITIONAL:
+                arguments[name] = value
+    elif env.spec is not None:
+        arguments = dict(env.spec.kwargs)
+    else:
+        arguments = {}
+        missing = [
+            p.name
+            for p in parameters.values()
+            if p.default is p.empty and p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)
+        ]
+        if missing:
+            raise SnapshotUnsupportedError(
+                f"{type(env).__name__} is restored by replay, and for clones its constructor's arguments "
+                f"{missing} must be known. Derive it from gymnasium.utils.EzPickle, or make it with gymnasium.make."
+            )
+    if "render_mode" in arguments:
+        arguments["render_mode"] = None
+    return arguments
+
+
+def uses_box2d(env: Any) -> bool:
+    """Return whether an environment holds a Box2D world.
+
+    :param env: an environment, or an object that one holds.
+    """
+    values = getattr(env, "__dict__", {}).values()
+    return hasattr(env, "step") and any(
+        type(value).__module__.partition(".")[0] == "Box2D" for value in values
+    )

@@ -1,0 +1,210 @@
+"""The state of a stack of layers: captured, checked, put back, cloned."""
+
+import contextlib
+import random
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+
+from sb3_mcbs.snapshot.attributes import freeze_attributes, thaw_attributes
+from sb3_mcbs.snapshot.errors import SnapshotMismatchError, SnapshotUnsupportedError
+from sb3_mcbs.snapshot.graph import Copier, Freezer, Node, Ref, RngMode, Thawer
+from sb3_mcbs.snapshot.kinds import KINDS, kind_of, plan_adapter
+from sb3_mcbs.snapshot.layers import Layer, layers_of
+from sb3_mcbs.snapshot.registry import SnapshotAdapter, find_adapter
+
+_NEEDS_RENDERING = "gymnasium.wrappers.transform_observation.AddRenderObservation"
+
+
+class FrozenLayer(NamedTuple):
+    """The captured state of one layer.
+
+    :param name: its class.
+    :param monitor: whether it is SB3's ``Monitor``, which may be missing where the state is put back.
+    :param adapted: what the layer's adapter captured, in a tuple; None if it has no adapter.
+    :param attributes: the frozen value of each captured attribute; None if none are captured.
+    """
+
+    name: str
+    monitor: bool
+    adapted: tuple[Any] | None
+    attributes: dict[str, Any] | None
+
+
+class Stack:
+    """The layers of one environment.
+
+    :param owner: the ``SnapshotEnvWrapper`` around them.
+    :raises SnapshotUnsupportedError: if a layer cannot be captured.
+    """
+
+    def __init__(self, owner: gym.Wrapper[Any, Any, Any, Any]) -> None:
+        self._layers = layers_of(owner.env)
+        self._stateful = [layer for layer in self._layers if not layer.recorder]
+        self._names = [layer.name for layer in self._stateful]
+        self._adapters: dict[int, SnapshotAdapter] = {}
+        self._owner = owner
+        for layer in self._layers:
+            if layer.name == _NEEDS_RENDERING:
+                raise SnapshotUnsupportedError(
+                    f"{layer.name} draws its observations, and copies of an environment cannot draw. "
+                    "Remove the wrapper."
+                )
+            adapter = find_adapter(layer.env)
+            if adapter is not None:
+                adapter.attach(layer.env)
+                self._adapters[id(layer.env)] = adapter
+        # A recorder is named as the layer below it: where the state is put back there may be none.
+        self._refs = {id(owner): Ref(0)}
+        place = 0
+        for layer in self._layers:
+            self._refs[id(layer.env)] = Ref(place)
+            place += not layer.recorder
+
+    @property
+    def incomplete_clones(self) -> bool:
+        """Whether a clone is not yet in the state of the original."""
+        return any(adapter.with_attributes for adapter in self._adapters.values())
+
+    def freeze(self) -> tuple[tuple[FrozenLayer, ...], tuple[Node, ...]]:
+        """Capture the state.
+
+        :return: the captured layers, outermost first, and the nodes that their values refer to.
+        :raises SnapshotUnsupportedError: if a layer holds something that cannot be captured.
+        """
+        freezer = Freezer(kind_of, self._refs, len(self._stateful))
+        frozen = tuple([self._freeze_layer(freezer, layer) for layer in self._stateful])
+        return frozen, tuple(freezer.nodes)
+
+    def _freeze_layer(self, freezer: Freezer, layer: Layer) -> FrozenLayer:
+        adapter = self._adapters.get(id(layer.env))
+        adapted = None if adapter is None else (adapter.capture(layer.env),)
+        attributes = None
+        if adapter is None or adapter.with_attributes:
+            attributes = freeze_attributes(freezer, layer.env, layer.not_state, adapter is not None)
+        return FrozenLayer(layer.name, layer.monitor, adapted, attributes)
+
+    def check(self, frozen: tuple[FrozenLayer, ...]) -> None:
+        """Refuse the state of other layers.
+
+        :param frozen: captured layers.
+        :raises SnapshotMismatchError: names the difference.
+        """
+        if self._names == [layer.name for layer in frozen]:
+            return
+        ours = [layer.name for layer in self._stateful if not layer.monitor]
+        theirs = [layer.name for layer in frozen if not layer.monitor]
+        if ours[-1] != theirs[-1]:
+            raise SnapshotMismatchError(
+                f"The snapshot is of a {theirs[-1]}, this environment is a {ours[-1]}."
+            )
+        if ours != theirs:
+            raise SnapshotMismatchError(
+                "The wrappers differ, outermost first: "
+                f"{_short(theirs)} in the snapshot, {_short(ours)} around this environment."
+            )
+        n_ours, n_theirs = len(self._stateful) - len(ours), len(frozen) - len(theirs)
+        if n_ours > n_theirs:
+            raise SnapshotMismatchError(
+                "This environment has a Monitor, and the snapshot is of one without: the episode in progress "
+                "that the Monitor should continue is not in it. Restore it into a clone() instead."
+            )
+
+    def thaw(self, frozen: tuple[FrozenLayer, ...], nodes: tuple[Node, ...], rng: RngMode) -> None:
+        """Put the layers into a captured state.
+
+        :param frozen: captured layers; :meth:`check` has passed.
+        :param nodes: the nodes that their values refer to.
+        :param rng: what becomes of random generators.
+        :raises SnapshotMismatchError: if the state does not fit; nothing has been changed then.
+        """
+        layers = self._pair(frozen)
+        known = [layer.env if layer is not None else None for layer in layers]
+        for place in reversed(range(len(known) - 1)):
+            if known[place] is None:
+                known[place] = known[place + 1]
+        thawer = Thawer(nodes, KINDS, known, rng)
+        for layer, captured in zip(layers, frozen, strict=True):
+            if layer is None:
+                continue
+            adapter = self._adapters.get(id(layer.env))
+            if captured.adapted is not None:
+                plan_adapter(thawer, adapter, layer.env, captured.adapted[0])
+            if captured.attributes is not None:
+                thaw_attributes(thawer, layer.env, layer.not_state, captured.attributes, adapter is None)
+        thawer.commit()
+
+    def _pair(self, frozen: tuple[FrozenLayer, ...]) -> list[Layer | None]:
+        """Find for each captured layer the one to restore; None for a Monitor that is not there."""
+        if len(frozen) == len(self._stateful):
+            return list(self._stateful)
+        monitors = iter([layer for layer in self._stateful if layer.monitor])
+        others = iter([layer for layer in self._stateful if not layer.monitor])
+        return [next(monitors, None) if captured.monitor else next(others) for captured in frozen]
+
+    def clone(self) -> gym.Env[Any, Any]:
+        """Copy the layers, without recorders and monitors.
+
+        :return: the outermost layer of the copy.
+        """
+        copies: dict[int, Any] = {}
+        copier = Copier(kind_of, copies)
+        ordinary: list[Layer] = []
+        below: Any = None
+        for layer in reversed(self._layers):
+            if not layer.recorder and not layer.monitor:
+                adapter = self._adapters.get(id(layer.env))
+                if adapter is None:
+                    below = object.__new__(type(layer.env))
+                    ordinary.append(layer)
+                else:
+                    with _global_generators_kept():
+                        below = adapter.clone(layer.env, copier.copy)
+            copies[id(layer.env)] = below
+        copies[id(self._owner)] = below
+        # Simulators first: attributes may be views into their memory.
+        for layer in ordinary:
+            for value in vars(layer.env).values():
+                kind = kind_of(value)
+                if kind is not None and kind.name == "adapter":
+                    copier.copy(value)
+        for layer in ordinary:
+            _copy_attributes(copier, layer)
+        for layer in self._layers[:-1]:
+            if copies[id(layer.env)] is not copies[id(layer.env.env)]:
+                copies[id(layer.env)].env = copies[id(layer.env.env)]
+        return below
+
+
+def _short(names: list[str]) -> str:
+    return " > ".join(name.rpartition(".")[2] for name in names)
+
+
+def _copy_attributes(copier: Copier, layer: Layer) -> None:
+    attributes = vars(copier.memo[id(layer.env)])
+    for name, value in vars(layer.env).items():
+        if name == "render_mode":
+            attributes[name] = None
+        elif name == "_ezpickle_kwargs" and "render_mode" in value:
+            attributes[name] = {**value, "render_mode": None}
+        elif name in layer.not_state:
+            attributes[name] = value
+        else:
+            try:
+                attributes[name] = copier.copy(value)
+            except SnapshotUnsupportedError as error:
+                error.path.insert(0, f"{type(layer.env).__name__}.{name}")
+                raise
+
+
+@contextlib.contextmanager
+def _global_generators_kept() -> Iterator[None]:
+    """Undo whatever a constructor does to the global generators of Python and NumPy."""
+    python, legacy = random.getstate(), np.random.get_state()
+    try:
+        yield
+    finally:
+        random.setstate(python)
+        np.random.set_state(legacy)

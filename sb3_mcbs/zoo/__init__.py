@@ -1,0 +1,6 @@
+"""RL Zoo's commands with this package: registration, evaluation of both policies, tuning, repeating."""
+
+from sb3_mcbs.zoo.paths import hyperparams_path
+from sb3_mcbs.zoo.registration import register
+
+__all__ = ["hyperparams_path", "register"]

@@ -1,0 +1,124 @@
+"""RL Zoo's ExperimentManager, for agents that search."""
+
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+from rl_zoo3.exp_manager import ExperimentManager
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_mcbs.search import SearchSettings
+from sb3_mcbs.snapshot import SnapshotEnvWrapper
+from sb3_mcbs.zoo.callbacks import SearchEvalCallback, SecondEvalCallback
+from sb3_mcbs.zoo.paths import hyperparams_path, sibling_folder
+from sb3_mcbs.zoo.registration import ALGORITHMS
+
+#: ``-conf sb3_mcbs`` names this package's file for the algorithm of the command line.
+PACKAGE_CONFIG = "sb3_mcbs"
+#: Agents with a policy and critics that a search can be put on.
+SEARCHABLE = ("ddpg", "sac", "td3", "tqc")
+
+
+class MCBSExperimentManager(ExperimentManager):
+    """
+    Finds this package's hyperparameter files and evaluates both policies of an agent.
+
+    For ``mcbs_td3`` the run folder's ``evaluations.npz`` is the agent with search, as it acts in training,
+    and the bare actor's goes to the sibling algorithm folder ``mcbs_td3_actor``. Another off-policy algorithm
+    whose hyperparameters contain ``search_evaluation`` (a dictionary of search settings) is evaluated as it
+    is in the run folder, and with search in the sibling folder ``ALGO_search``. All else is RL Zoo's.
+
+    The parameters are those of ``rl_zoo3.exp_manager.ExperimentManager``.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        arguments = inspect.signature(ExperimentManager.__init__).bind(self, *args, **kwargs).arguments
+        super().__init__(*args, **kwargs)
+        self.search_evaluation: dict[str, Any] | None = None
+        config = arguments.get("config")
+        if config == PACKAGE_CONFIG or (config is None and self.algo in ALGORITHMS):
+            self.config = str(hyperparams_path(self.algo))
+
+    def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """
+        Read the hyperparameters as RL Zoo does, and accept 0 as a trial's number.
+
+        :return: the hyperparameters, and the same in order, to be saved
+        """
+        first_trial = self.trial_id == 0 and self.storage and self.study_name
+        if first_trial and self.algo in ALGORITHMS and not self.optimize_hyperparameters:
+            print("Loading from Optuna study...")
+            trial = self.load_trial(str(self.storage), str(self.study_name), 0)
+            self.custom_hyperparams = {**trial, **(self.custom_hyperparams or {})}
+        return super().read_hyperparameters()
+
+    def _preprocess_hyperparams(
+        self, hyperparams: dict[str, Any]
+    ) -> tuple[dict[str, Any], Any, list[Any], Any]:
+        settings = hyperparams.pop("search_evaluation", None)
+        if settings is not None:
+            self.search_evaluation = _checked_search_evaluation(settings, self.algo)
+        return super()._preprocess_hyperparams(hyperparams)
+
+    def create_callbacks(self) -> None:
+        """Create RL Zoo's callbacks, and the second evaluation just before the run's own."""
+        super().create_callbacks()
+        index = next((i for i, cb in enumerate(self.callbacks) if isinstance(cb, SearchEvalCallback)), None)
+        if index is None or (self.algo not in ALGORITHMS and self.search_evaluation is None):
+            return
+        label = "actor" if self.algo in ALGORITHMS else "search"
+        if self.verbose > 0:
+            print("Creating second test environment")
+        second = SecondEvalCallback(
+            self._create_second_eval_envs(),
+            label,
+            self.search_evaluation,
+            n_eval_episodes=self.n_eval_episodes,
+            log_path=str(sibling_folder(self.save_path, label)),
+            eval_freq=self.eval_freq,
+            deterministic=self.deterministic_eval,
+        )
+        self.callbacks.insert(index, second)
+
+    def _create_second_eval_envs(self) -> VecEnv:
+        wrapper = self.env_wrapper
+        if self.search_evaluation is not None and self.search_evaluation.get("rollout_depth") != 0:
+            self.env_wrapper = _wrapped_for_search(wrapper)
+        try:
+            return self.create_envs(self.n_eval_envs, eval_env=True)
+        finally:
+            self.env_wrapper = wrapper
+
+
+def _checked_search_evaluation(settings: Any, algo: str) -> dict[str, Any]:
+    if algo not in SEARCHABLE:
+        reason = (
+            "is evaluated with its training's search settings already"
+            if algo in ALGORITHMS
+            else "has no policy and critics to search with"
+        )
+        raise ValueError(
+            f"search_evaluation is for {', '.join(SEARCHABLE)}; {algo} {reason}. "
+            "Remove it from the hyperparameters."
+        )
+    if not isinstance(settings, dict):
+        raise TypeError(
+            "search_evaluation must be a dictionary of search settings such as "
+            f"{{beam_width: 6, rollout_depth: 3}}, got {settings!r}."
+        )
+    unknown = sorted(set(settings) - set(SearchSettings.names()))
+    if unknown:
+        raise ValueError(
+            f"search_evaluation has unknown settings: {', '.join(unknown)}. "
+            f"Known are: {', '.join(SearchSettings.names())}."
+        )
+    SearchSettings(**settings)
+    return dict(settings)
+
+
+def _wrapped_for_search(wrapper: Callable[[gym.Env], gym.Env] | None) -> Callable[[gym.Env], gym.Env]:
+    def wrap(env: gym.Env) -> gym.Env:
+        return SnapshotEnvWrapper(env if wrapper is None else wrapper(env))
+
+    return wrap

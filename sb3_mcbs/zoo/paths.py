@@ -1,0 +1,37 @@
+"""Where this package's hyperparameter files and an RL Zoo run's files lie."""
+
+from pathlib import Path
+
+PACKAGE_ROOT = Path(__file__).resolve().parents[1]
+
+
+def hyperparams_path(algo: str) -> Path:
+    """
+    Find the hyperparameter file of an algorithm, in an installed package or in a checkout.
+
+    :param algo: the algorithm's name on RL Zoo's command line, ``mcbs_td3`` or (our baseline) ``td3``
+    :return: path of its YAML file
+    :raises FileNotFoundError: if this package has no file for the algorithm
+    """
+    folders = [PACKAGE_ROOT / "hyperparams", PACKAGE_ROOT.parent / "hyperparams"]
+    for folder in folders:
+        path = folder / f"{algo}.yml"
+        if path.is_file():
+            return path
+    known = sorted({path.stem for folder in folders for path in folder.glob("*.yml")})
+    raise FileNotFoundError(
+        f"sb3-mcbs has no hyperparameters for {algo!r}, only for: {', '.join(known) or 'nothing'}. "
+        "Name a file of your own with -conf FILE."
+    )
+
+
+def sibling_folder(run_folder: str | Path, label: str) -> Path:
+    """
+    Where the second evaluation of a run goes: RL Zoo's plots take each algorithm folder as one curve.
+
+    :param run_folder: a run's folder, ``LOGS/ALGO/ENV_NUMBER``
+    :param label: what the second evaluation measures, ``actor`` or ``search``
+    :return: ``LOGS/ALGO_LABEL/ENV_NUMBER``
+    """
+    run_folder = Path(run_folder)
+    return run_folder.parent.with_name(f"{run_folder.parent.name}_{label}") / run_folder.name

@@ -1,0 +1,62 @@
+"""Shared pieces of the tests."""
+
+from collections.abc import Callable
+from copy import deepcopy
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from stable_baselines3.common.env_util import make_vec_env
+
+from sb3_mcbs import MCBSTD3, SnapshotEnvWrapper
+
+SMALL = dict(policy_kwargs=dict(net_arch=[16, 16]), buffer_size=2000, batch_size=16, device="cpu")
+SMALL_SEARCH = dict(beam_width=3, rollout_depth=2, n_simulations=2, n_threads=1)
+
+
+class DictPendulum(gym.ObservationWrapper):
+    """Pendulum whose observation is a Dict, so that only copies of the environment can simulate it."""
+
+    def __init__(self, env: gym.Env) -> None:
+        super().__init__(env)
+        low, high = env.observation_space.low, env.observation_space.high
+        self.observation_space = spaces.Dict(
+            {"angle": spaces.Box(low[:2], high[:2]), "speed": spaces.Box(low[2:], high[2:])}
+        )
+
+    def observation(self, observation):
+        return {"angle": observation[:2], "speed": observation[2:]}
+
+
+@pytest.fixture
+def make_agent() -> Callable[..., MCBSTD3]:
+    """Build a small MCBSTD3; keyword arguments override its settings."""
+
+    def make(env="Pendulum-v1", policy: str = "MlpPolicy", cls: type = MCBSTD3, **settings) -> MCBSTD3:
+        search = SMALL_SEARCH if issubclass(cls, MCBSTD3) else {}
+        # SAC writes into the policy_kwargs that it is given.
+        return cls(policy, env, **{"seed": 0, "learning_starts": 20, **deepcopy(SMALL), **search, **settings})
+
+    return make
+
+
+@pytest.fixture
+def make_dict_env() -> Callable[[], gym.Env]:
+    return lambda: DictPendulum(gym.make("Pendulum-v1"))
+
+
+def snapshot_vec_env(env_id: str, n_envs: int = 1, **kwargs):
+    """A vectorized environment whose environments can be captured, as RL Zoo makes it."""
+    return make_vec_env(env_id, n_envs, seed=0, wrapper_class=SnapshotEnvWrapper, **kwargs)
+
+
+def parameters_of(agent) -> dict[str, np.ndarray]:
+    return {name: value.detach().cpu().numpy().copy() for name, value in agent.policy.state_dict().items()}
+
+
+def assert_same_parameters(left, right) -> None:
+    left, right = parameters_of(left), parameters_of(right)
+    assert left.keys() == right.keys()
+    for name in left:
+        np.testing.assert_array_equal(left[name], right[name], err_msg=name)

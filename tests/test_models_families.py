@@ -1,0 +1,178 @@
+"""The batch model gives what Gymnasium's MuJoCo environments give, bit for bit."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from sb3_mcbs.models import LocalEnvironments, MujocoBatchModel
+from sb3_mcbs.models.families import known_families
+from sb3_mcbs.snapshot import SnapshotEnvWrapper
+
+REGISTERED = [
+    env_id
+    for env_id, spec in gym.registry.items()
+    if isinstance(spec.entry_point, str) and spec.entry_point.startswith("gymnasium.envs.mujoco.")
+]
+# It refuses every MuJoCo that has a batch.
+CONSTRUCTIBLE = [env_id for env_id in REGISTERED if env_id != "Pusher-v4"]
+
+INCLUDES = [f"include_{name}_in_observation" for name in ("cinert", "cvel", "qfrc_actuator", "cfrc_ext")]
+NOTHING_INCLUDED = dict.fromkeys(INCLUDES, False)
+WITH_POSITIONS = {"exclude_current_positions_from_observation": False}
+UNHEALTHY = {"terminate_when_unhealthy": False, "healthy_reward": 3}
+
+VARIATIONS = [
+    ("HalfCheetah-v4", {**WITH_POSITIONS, "ctrl_cost_weight": 0.3, "forward_reward_weight": 2}),
+    ("HalfCheetah-v5", {**WITH_POSITIONS, "frame_skip": 3, "ctrl_cost_weight": np.float64(0.7)}),
+    ("HalfCheetah-v5", {"xml_file": "walker2d.xml", "forward_reward_weight": 0.25, "reset_noise_scale": 0.3}),
+    ("Swimmer-v4", {**WITH_POSITIONS, "ctrl_cost_weight": 0.1}),
+    ("Swimmer-v5", {**WITH_POSITIONS, "frame_skip": 1, "forward_reward_weight": -1.5}),
+    ("Hopper-v4", {**WITH_POSITIONS, **UNHEALTHY, "healthy_z_range": (1.2, 1.3)}),
+    ("Hopper-v5", {**UNHEALTHY, "healthy_state_range": (-1, 1), "healthy_angle_range": (-0.01, 0.02)}),
+    ("Hopper-v5", {"healthy_state_range": (-2.0, 2.0), "ctrl_cost_weight": 0.5, "frame_skip": 2}),
+    ("Walker2d-v4", {**UNHEALTHY, "healthy_z_range": (1.2, 1.25), "ctrl_cost_weight": 1}),
+    ("Walker2d-v5", {**WITH_POSITIONS, "healthy_reward": -0.5, "healthy_angle_range": (-0.02, 0.02)}),
+    ("Ant-v4", {"use_contact_forces": True, "contact_cost_weight": 0.1, "contact_force_range": (-2, 3)}),
+    ("Ant-v4", {**WITH_POSITIONS, **UNHEALTHY, "healthy_z_range": (0.6, 0.7)}),
+    ("Ant-v5", {"include_cfrc_ext_in_observation": False, "contact_cost_weight": 0}),
+    ("Ant-v5", {"include_cfrc_ext_in_observation": False, "contact_cost_weight": 0.2, "main_body": "aux_1"}),
+    (
+        "Ant-v5",
+        {**WITH_POSITIONS, **UNHEALTHY, "main_body": 4, "frame_skip": 2, "healthy_z_range": (0.6, 0.7)},
+    ),
+    ("Humanoid-v4", {**WITH_POSITIONS, **UNHEALTHY, "healthy_z_range": (1.38, 1.4), "ctrl_cost_weight": 0.3}),
+    ("Humanoid-v5", {**NOTHING_INCLUDED, "contact_cost_weight": 0.001, "contact_cost_range": (0.1, 2.0)}),
+    ("Humanoid-v5", {"include_cvel_in_observation": False, "include_cinert_in_observation": 1, **UNHEALTHY}),
+    ("Humanoid-v5", {**NOTHING_INCLUDED, "contact_cost_weight": 0, "contact_cost_range": (0.5, 2.0)}),
+    ("HumanoidStandup-v5", {"include_cfrc_ext_in_observation": False, "impact_cost_weight": 0}),
+    ("HumanoidStandup-v5", {**WITH_POSITIONS, "impact_cost_weight": 0.01, "impact_cost_range": (0.0, 1.0)}),
+    (
+        "HumanoidStandup-v5",
+        {**NOTHING_INCLUDED, "uph_cost_weight": 2, "ctrl_cost_weight": 0.2, "frame_skip": 2},
+    ),
+    ("InvertedPendulum-v5", {"frame_skip": 4, "reset_noise_scale": 0.15}),
+    ("InvertedDoublePendulum-v5", {"healthy_reward": 3, "frame_skip": 2, "reset_noise_scale": 0.3}),
+    ("Reacher-v5", {"reward_dist_weight": 2.5, "reward_control_weight": 0.3, "frame_skip": 3}),
+    ("Pusher-v5", {"reward_near_weight": 2, "reward_dist_weight": 0.3, "reward_control_weight": 3}),
+]
+CASES = [(env_id, {}) for env_id in CONSTRUCTIBLE] + VARIATIONS
+
+STEPS = 6
+
+
+def assert_bitwise(ours: object, theirs: object) -> None:
+    ours, theirs = np.asarray(ours), np.asarray(theirs)
+    assert ours.dtype == theirs.dtype
+    np.testing.assert_array_equal(ours, theirs)
+    assert ours.tobytes() == theirs.tobytes()
+
+
+def test_every_registered_class_has_a_family() -> None:
+    registered = set()
+    for env_id in CONSTRUCTIBLE:
+        module, name = gym.registry[env_id].entry_point.split(":")
+        registered.add((module, name))
+    assert len(registered) == len(CONSTRUCTIBLE) == 21
+    assert registered <= {(kind.__module__, kind.__name__) for kind in known_families()}
+
+
+@pytest.mark.parametrize(
+    ("env_id", "kwargs"), CASES, ids=lambda value: value if isinstance(value, str) else ""
+)
+def test_transitions_are_bitwise_equal(env_id: str, kwargs: dict) -> None:
+    """Rows follow the real environment from a reset, from mid-episode and beyond a termination."""
+    env = SnapshotEnvWrapper(gym.make(env_id, **kwargs))
+    model = MujocoBatchModel(LocalEnvironments([env]), n_threads=2)
+    rng = np.random.default_rng(1)
+    low, high = env.action_space.low, env.action_space.high
+    env.reset(seed=3)
+    for already_taken in (0, 11, 17):
+        for _ in range(already_taken):
+            env.step(rng.uniform(low, high).astype(np.float32))
+        model.set_roots(model.read_roots([0]), np.zeros(5, dtype=int), rng)
+        for _ in range(STEPS):
+            actions = rng.uniform(low, high, size=(5, *low.shape)).astype(np.float32)
+            actions[1], actions[3] = low, high
+            # The first and the last row do what the real environment does, those between do not.
+            actions[4] = actions[0]
+            transition = model.step(actions)
+            observation, reward, terminated, _, _ = env.step(actions[0])
+            for row in (0, 4):
+                assert_bitwise(transition.observations[row], observation)
+                assert_bitwise(transition.rewards[row], np.float64(reward))
+                assert transition.terminated[row] == terminated
+            assert transition.observations[1].tobytes() != observation.tobytes()
+            assert transition.valid.all()
+    model.close()
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("env_id", "kwargs"),
+    [
+        ("Hopper-v5", {}),
+        ("InvertedPendulum-v5", {}),
+        ("InvertedDoublePendulum-v4", {}),
+        ("Ant-v5", {"healthy_z_range": (0.5, 1.0)}),
+    ],
+)
+def test_terminations_are_seen_at_the_same_step(env_id: str, kwargs: dict) -> None:
+    env = SnapshotEnvWrapper(gym.make(env_id, **kwargs))
+    model = MujocoBatchModel(LocalEnvironments([env]), n_threads=1)
+    env.reset(seed=0)
+    model.set_roots(model.read_roots([0]), np.zeros(1, dtype=int), np.random.default_rng())
+    ends = []
+    for _ in range(400):
+        transition = model.step(env.action_space.high[None])
+        _, _, terminated, _, _ = env.step(env.action_space.high)
+        assert transition.terminated[0] == terminated
+        ends.append(terminated)
+        if terminated:
+            break
+    assert ends[-1]
+
+
+def test_the_rows_sizes_do_not_change_the_numbers() -> None:
+    """Vectorised sums must not depend on how many rows there are, nor on the threads."""
+    env = SnapshotEnvWrapper(gym.make("Humanoid-v5"))
+    env.reset(seed=0)
+    actions = np.random.default_rng(0).uniform(-0.4, 0.4, size=(40, 17)).astype(np.float32)
+    results = []
+    for n_threads, rows in ((1, 40), (3, 40), (2, 7), (1, 1)):
+        model = MujocoBatchModel(LocalEnvironments([env]), n_threads=n_threads)
+        model.set_roots(model.read_roots([0]), np.zeros(rows, dtype=int), np.random.default_rng())
+        results.append((model.step(actions[:rows]), model.step(actions[:rows])))
+        model.close()
+    for other in results[1:]:
+        for ours, theirs in zip(other, results[0], strict=True):
+            assert_bitwise(ours.observations, theirs.observations[: len(ours.observations)])
+            assert_bitwise(ours.rewards, theirs.rewards[: len(ours.rewards)])
+
+
+def test_float64_actions_reach_the_simulator_as_they_are() -> None:
+    env = SnapshotEnvWrapper(gym.make("HalfCheetah-v5"))
+    env.reset(seed=0)
+    model = MujocoBatchModel(LocalEnvironments([env]), n_threads=1)
+    model.set_roots(model.read_roots([0]), np.zeros(2, dtype=int), np.random.default_rng())
+    actions = np.random.default_rng(0).uniform(-1, 1, size=(2, 6))
+    transition = model.step(actions)
+    observation, reward, *_ = env.step(actions[1])
+    assert_bitwise(transition.observations[1], observation)
+    assert_bitwise(transition.rewards[1], np.float64(reward))
+
+
+@pytest.mark.parametrize(
+    ("env_id", "kwargs", "engine"),
+    [
+        ("Walker2d-v5", {}, "BatchEngine"),
+        ("Ant-v4", {}, "BatchEngine"),
+        ("Ant-v4", {"use_contact_forces": True}, "ThreadEngine"),
+        ("Ant-v5", {}, "ThreadEngine"),
+        ("Ant-v5", {"include_cfrc_ext_in_observation": False, "contact_cost_weight": 0}, "BatchEngine"),
+        ("Humanoid-v5", {"include_cfrc_ext_in_observation": False, "contact_cost_weight": 0}, "BatchEngine"),
+        ("HumanoidStandup-v5", {"include_cfrc_ext_in_observation": False}, "ThreadEngine"),
+    ],
+)
+def test_the_slower_engine_is_taken_only_for_contact_forces(env_id: str, kwargs: dict, engine: str) -> None:
+    env = SnapshotEnvWrapper(gym.make(env_id, **kwargs))
+    assert engine in MujocoBatchModel(LocalEnvironments([env]), n_threads=1).description

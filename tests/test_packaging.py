@@ -1,0 +1,160 @@
+"""What is installed, and what an installation does to an interpreter."""
+
+import os
+import re
+import subprocess
+import sys
+import tomllib
+import zipfile
+from collections.abc import Iterator
+from itertools import chain
+from pathlib import Path
+
+import pytest
+
+import _sb3_mcbs_build as build
+
+ROOT = Path(__file__).resolve().parents[1]
+METADATA = tomllib.loads((ROOT / "pyproject.toml").read_text())
+#: What RL Zoo's commands import without declaring it.
+UNDECLARED_BY_RL_ZOO = {"moviepy", "pandas", "requests", "rich", "tensorboard", "tqdm"}
+
+
+def normalised(requirement: str) -> str:
+    name = re.match(r"[A-Za-z0-9._-]+", requirement)
+    assert name is not None, requirement
+    return re.sub(r"[-_.]+", "-", name[0]).lower()
+
+
+@pytest.fixture(scope="module")
+def pins() -> dict[str, str]:
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    entries = [line for line in lines if line and not line.startswith("#")]
+    assert all(re.fullmatch(r"[A-Za-z0-9._-]+==[0-9][0-9A-Za-z.]*", entry) for entry in entries), entries
+    return {normalised(entry): entry.partition("==")[2] for entry in entries}
+
+
+def test_every_dependency_is_open_in_the_metadata_and_pinned_in_the_constraints(pins: dict[str, str]) -> None:
+    project = METADATA["project"]
+    requirements = [*project["dependencies"], *chain(*project["optional-dependencies"].values())]
+    assert not [requirement for requirement in requirements if "==" in requirement or "<" in requirement]
+    assert {normalised(requirement) for requirement in requirements} <= set(pins)
+    assert pins["torch"] == "2.13.0"
+
+
+def test_commands_of_rl_zoo_find_what_they_import() -> None:
+    assert {normalised(entry) for entry in METADATA["project"]["dependencies"]} >= UNDECLARED_BY_RL_ZOO
+    plots = {normalised(entry) for entry in METADATA["project"]["optional-dependencies"]["plots"]}
+    assert plots >= {"rliable", "scipy", "seaborn"}
+
+
+def test_pth_line_survives_whatever_goes_wrong(tmp_path: Path) -> None:
+    (tmp_path / "_sb3_mcbs_hook.py").write_text("raise RuntimeError('broken')\n")
+    assert build.PTH_LINE.count("\n") == 1 and build.PTH_LINE.startswith("import ")
+    for path in (tmp_path, tmp_path / "nowhere"):
+        code = f"import sys; sys.path[:0] = [{str(path)!r}]\n{build.PTH_LINE}print('alive')"
+        done = subprocess.run(
+            [sys.executable, "-I", "-S", "-c", code], capture_output=True, text=True, check=True
+        )
+        assert (done.stdout, done.stderr) == ("alive\n", "")
+
+
+def test_files_added_to_a_wheel_are_recorded(tmp_path: Path) -> None:
+    wheel = tmp_path / "a-1-py3-none-any.whl"
+    with zipfile.ZipFile(wheel, "w") as archive:
+        archive.writestr("a.py", "x = 1\n")
+        archive.writestr("a-1.dist-info/RECORD", "a.py,,\na-1.dist-info/RECORD,,\n")
+    build.add_to_wheel(wheel, {"a.pth": b"import a\n"})
+    with zipfile.ZipFile(wheel) as archive:
+        assert sorted(archive.namelist()) == ["a-1.dist-info/RECORD", "a.pth", "a.py"]
+        assert archive.read("a.pth") == b"import a\n"
+        assert archive.read("a.py") == b"x = 1\n"
+        # sha256 of the nine bytes, URL-safe base64 without padding.
+        record = archive.read("a-1.dist-info/RECORD").decode().splitlines()
+        assert "a.pth,sha256=BrJAlXgrDEe7igFhXyMQkumY_81HoRQgLOdTAVv42f4,9" in record
+    assert list(tmp_path.iterdir()) == [wheel]
+
+
+class Environment:
+    """A virtual environment that sees the packages of the present one, but not this project."""
+
+    def __init__(self, folder: Path) -> None:
+        subprocess.run([sys.executable, "-m", "venv", "--without-pip", folder], check=True)
+        self.python = folder / "bin" / "python"
+        self.site_packages = next(folder.glob("lib/python*/site-packages"))
+        base = next(path for path in map(Path, sys.path) if (path / "stable_baselines3").is_dir())
+        # The present environment's .pth files are not processed this way, this project's hook included.
+        (self.site_packages / "base.pth").write_text(f"{base}\n")
+
+    def run(self, *words: str, cwd: Path | None = None, **environment: str) -> str:
+        done = subprocess.run(
+            [self.python, *words],
+            cwd=cwd or self.python.parent,
+            capture_output=True,
+            text=True,
+            check=False,
+            env={**{k: v for k, v in os.environ.items() if k != "PYTHONPATH"}, **environment},
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+    def pip(self, *words: str) -> str:
+        return self.run("-m", "pip", *words)
+
+
+@pytest.fixture(scope="module", params=["wheel", "editable"])
+def installed(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Environment]:
+    """This project, installed from a copy, so that building leaves nothing in the checkout."""
+    folder = tmp_path_factory.mktemp(request.param)
+    source = folder / "source"
+    source.mkdir()
+    for name in ("sb3_mcbs", "hyperparams", *(path.name for path in ROOT.glob("*.*"))):
+        if not name.endswith(".egg-info"):
+            subprocess.run(["cp", "-r", ROOT / name, source], check=True)
+    for name in ("LICENSE", "README.md"):
+        (source / name).write_text((ROOT / name).read_text() if (ROOT / name).is_file() else "")
+    environment = Environment(folder / "environment")
+    target = ["-e", str(source)] if request.param == "editable" else [str(source)]
+    environment.pip("install", "--quiet", "--no-deps", "--no-build-isolation", *target)
+    yield environment
+    environment.pip("uninstall", "--yes", "--quiet", "sb3-mcbs")
+    left = [
+        path.name
+        for path in environment.site_packages.iterdir()
+        if path.name not in ("base.pth", "__pycache__")
+    ]
+    assert left == []
+    assert environment.run("-c", "import sys; print([m for m in sys.modules if 'mcbs' in m])").strip() == "[]"
+
+
+@pytest.mark.slow
+def test_installation_registers_in_any_folder(installed: Environment, tmp_path: Path) -> None:
+    code = (
+        "import sys; assert not [m for m in sys.modules if m.startswith(('sb3_mcbs', 'rl_zoo3', 'torch'))];"
+        "import rl_zoo3.train as t; print('mcbs_td3' in t.ALGOS, t.ExperimentManager.__name__);"
+        "from sb3_mcbs.zoo.paths import *\n"
+        "print(hyperparams_path('td3'), (PACKAGE_ROOT / 'py.typed').is_file())"
+    )
+    added, manager, file, typed = installed.run("-c", code, cwd=tmp_path).split()
+    assert (added, manager, typed) == ("True", "MCBSExperimentManager", "True")
+    assert Path(file).is_file() and ROOT not in Path(file).parents
+    off = "import rl_zoo3; print('mcbs_td3' in rl_zoo3.ALGOS)"
+    assert installed.run("-c", off, cwd=tmp_path, SB3_MCBS_NO_ZOO_HOOK="1").strip() == "False"
+
+
+@pytest.mark.slow
+def test_rl_zoos_own_commands_work_in_any_folder(installed: Environment, tmp_path: Path) -> None:
+    words = ["--algo", "mcbs_td3", "--env", "Pendulum-v1", "-f", "logs"]
+    tiny = ["learning_starts:100", "batch_size:16", "beam_width:2", "n_simulations:1"]
+    short = ["-n", "240", "--eval-freq", "120", "--eval-episodes", "1", "-params", *tiny]
+    output = installed.run("-m", "rl_zoo3.train", *words, *short, cwd=tmp_path)
+    assert "Evaluating with search" in output and "Eval of the actor alone" in output
+    output = installed.run("-m", "rl_zoo3.enjoy", *words, "--no-render", "-n", "200", cwd=tmp_path)
+    assert "1 Episodes" in output
+    plots = ["-a", "mcbs_td3", "mcbs_td3_actor", "-e", "Pendulum-v1", "-f", "logs", "--no-display"]
+    output = installed.run("-m", "rl_zoo3.plots.all_plots", *plots, cwd=tmp_path, MPLBACKEND="agg")
+    assert "MCBS_TD3_ACTOR" in output and "Eval not found" not in output
+    report = installed.run("-m", "sb3_mcbs.zoo.cli", "report", "--env", "Pendulum-v1", cwd=tmp_path)
+    assert "Mean return of the actor alone" in report and "Mean return of the actor with search" in report

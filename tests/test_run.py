@@ -1,0 +1,200 @@
+"""MCBSTD3 trains: every kind of environment and policy, SB3's own behaviour kept."""
+
+import json
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3 import TD3
+from stable_baselines3.common.callbacks import CallbackList, CheckpointCallback, EvalCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecMonitor, VecNormalize
+
+from sb3_mcbs import MCBSTD3, SnapshotEnvWrapper
+from tests.conftest import assert_same_parameters, parameters_of, snapshot_vec_env
+
+
+def logged(agent, folder):
+    """Everything that was logged, as one list of dicts."""
+    agent.set_logger(configure(str(folder), ["json"]))
+    return lambda: [json.loads(line) for line in (folder / "progress.json").read_text().splitlines()]
+
+
+@pytest.mark.parametrize("env_id", ["HalfCheetah-v5", "Pendulum-v1"])
+@pytest.mark.parametrize("depth", [0, 1, 3])
+def test_trains(make_agent, env_id, depth):
+    agent = make_agent(env_id, rollout_depth=depth)
+    before = parameters_of(agent)["actor.mu.0.weight"]
+    agent.learn(60)
+    assert agent.num_timesteps == 60 and agent.n_decisions == 40
+    first_steps, later_steps = 3, (depth - 1) * 6
+    assert agent.n_simulated_steps == (40 * (first_steps + later_steps) if depth else 0)
+    assert not np.array_equal(before, parameters_of(agent)["actor.mu.0.weight"])
+
+
+def test_dict_observations(make_agent, make_dict_env):
+    agent = make_agent(make_dict_env(), policy="MultiInputPolicy")
+    agent.learn(40)
+    assert agent.n_decisions == 20
+
+
+@pytest.mark.parametrize("vec_env_cls", [DummyVecEnv, SubprocVecEnv])
+@pytest.mark.parametrize("env_id", ["Swimmer-v5", "Pendulum-v1"])
+def test_many_environments(make_agent, vec_env_cls, env_id):
+    env = VecMonitor(snapshot_vec_env(env_id, 2, vec_env_cls=vec_env_cls))
+    agent = make_agent(VecNormalize(env), n_threads=2)
+    agent.learn(60)
+    assert agent.n_decisions == 40
+    env.close()
+
+
+def test_processes_and_one_process_train_alike(make_agent):
+    agents = []
+    for vec_env_cls in (DummyVecEnv, SubprocVecEnv):
+        env = snapshot_vec_env("HalfCheetah-v5", 2, vec_env_cls=vec_env_cls)
+        agents.append(make_agent(env).learn(50))
+        env.close()
+    assert_same_parameters(*agents)
+
+
+def test_workers_that_are_not_wrapped_are_refused(make_agent):
+    env = make_vec_env("Pendulum-v1", 1, vec_env_cls=SubprocVecEnv)
+    with pytest.raises(ValueError, match="env_wrapper: sb3_mcbs.SnapshotEnvWrapper"):
+        make_agent(env)
+    env.close()
+
+
+def test_unknown_vectorized_wrapper_is_refused(make_agent):
+    with pytest.raises(ValueError, match="VecFrameStack"):
+        make_agent(VecFrameStack(make_vec_env("Pendulum-v1", 1), 2))
+
+
+def test_same_seed_same_run_and_threads_change_nothing(make_agent):
+    one, two, other = (make_agent("Hopper-v5", seed=s, n_threads=n).learn(60) for s, n in [(3, 1), (3, 2), (4, 1)])
+    assert_same_parameters(one, two)
+    np.testing.assert_array_equal(one.replay_buffer.actions[:60], two.replay_buffer.actions[:60])
+    assert not np.array_equal(one.replay_buffer.actions[:60], other.replay_buffer.actions[:60])
+
+
+def test_before_learning_starts_it_is_td3(make_agent):
+    """The same random numbers are drawn in the same order as in TD3 until the first search."""
+    noise = NormalActionNoise(np.zeros(1), 0.1 * np.ones(1))
+    agents = [make_agent(cls=cls, action_noise=noise, learning_starts=30).learn(30) for cls in (TD3, MCBSTD3)]
+    plain, searching = (agent.replay_buffer.actions[:30] for agent in agents)
+    np.testing.assert_array_equal(plain, searching)
+    assert agents[1].n_decisions == 0
+
+
+def test_searched_action_is_executed_and_stored_as_it_is(make_agent):
+    """RL Zoo's settings contain action noise; SB3 would add it to the chosen action."""
+    executed = []
+
+    class Spy(gym.ActionWrapper):
+        def action(self, action):
+            executed.append(np.array(action))
+            return action
+
+    env = Spy(gym.make("Pendulum-v1"))
+    agent = make_agent(env, action_noise=NormalActionNoise(np.zeros(1), 5.0 * np.ones(1)))
+    chosen = []
+    agent._setup_learn(1)
+    search = agent._searcher.search
+    agent._searcher.search = lambda obs, rng: chosen.append(search(obs, rng)) or chosen[-1]
+    agent.learn(40)
+    assert len(chosen) == 20
+    searched = np.concatenate([result.actions for result in chosen])
+    np.testing.assert_array_equal(agent.replay_buffer.actions[20:40, 0], searched)
+    real = [action for action in executed if action.shape == (1,)][-20:]
+    assert len(real) == 20
+
+
+def test_action_noise_after_search_is_an_option(make_agent):
+    noise = NormalActionNoise(np.zeros(1), 5.0 * np.ones(1))
+    quiet = make_agent(action_noise=noise).learn(40).replay_buffer.actions[20:40]
+    loud = make_agent(action_noise=noise, action_noise_after_search=True).learn(40).replay_buffer.actions[20:40]
+    assert np.mean(np.abs(loud) == 1) > 0.5 > np.mean(np.abs(quiet) == 1)
+
+
+def test_logs(make_agent, tmp_path):
+    agent = make_agent("Pendulum-v1", learning_starts=100)
+    read = logged(agent, tmp_path)
+    agent.learn(800, log_interval=1)
+    entries = [entry for entry in read() if entry.get("search/decisions")]
+    assert [entry["search/decisions"] for entry in entries] == [100, 300, 500, 700]
+    for entry in entries:
+        assert entry["search/model_error"] == 0
+        assert entry["search/invalid_rollouts"] == 0
+        assert entry["search/simulated_steps"] == entry["search/decisions"] * 9
+        assert entry["search/value_gain"] > 0 and entry["search/beam_std"] > 0
+        assert entry["search/ms_per_decision"] > 0
+
+
+def test_an_edited_environment_is_followed(make_agent, tmp_path):
+    """Domain randomisation: the simulator's copy of the model must not stay behind."""
+    agent = make_agent("HalfCheetah-v5")
+    read = logged(agent, tmp_path)
+    agent.learn(30)
+    model = agent.get_env().envs[0].unwrapped.model
+    model.body_mass[:] *= 1.3
+    with pytest.warns(UserWarning, match="edited"):
+        agent.learn(10, reset_num_timesteps=False)
+    agent._searcher.settings  # the batch was kept
+    assert agent._searcher.model.kind == "mujoco"
+    agent.logger.dump(1)
+    agent.learn(20, reset_num_timesteps=False)
+    agent.logger.dump(2)
+    errors = [entry["search/model_error"] for entry in read()]
+    assert errors[0] > 0 and errors[-1] == 0
+
+
+class RandomPush(gym.Wrapper):
+    """Adds a random push to every action: the same action does not give the same step."""
+
+    def step(self, action):
+        return self.env.step(action + self.np_random.uniform(-0.5, 0.5, size=1).astype(np.float32))
+
+
+def test_random_dynamics_are_simulated_with_generators_of_their_own(make_agent):
+    agent = make_agent(RandomPush(gym.make("Pendulum-v1")))
+    agent.learn(40)
+    assert not agent._searcher.model.deterministic
+    assert agent.n_simulated_steps == 20 * 3 * 2 * 2
+
+
+def test_monitor_file_counts_only_real_episodes(make_agent, tmp_path):
+    env = Monitor(gym.make("Pendulum-v1"), str(tmp_path / "run"))
+    make_agent(env).learn(450)
+    rows = (tmp_path / "run.monitor.csv").read_text().splitlines()[2:]
+    assert [row.split(",")[1] for row in rows] == ["200", "200"]
+
+
+def test_callbacks_and_set_env(make_agent, tmp_path):
+    agent = make_agent("Pendulum-v1", verbose=0)
+    callbacks = CallbackList(
+        [
+            CheckpointCallback(25, str(tmp_path)),
+            EvalCallback(make_vec_env("Pendulum-v1", 1), n_eval_episodes=1, eval_freq=30, verbose=0),
+        ]
+    )
+    agent.learn(60, callback=callbacks)
+    assert (tmp_path / "rl_model_50_steps.zip").exists()
+    agent.set_env(make_vec_env("Pendulum-v1", 1, seed=5))
+    agent.learn(30, reset_num_timesteps=False)
+    assert agent.n_decisions == 70 and agent.num_timesteps == 90
+
+
+def test_environments_are_wrapped_in_place(make_agent):
+    env = make_vec_env("Pendulum-v1", 2)
+    agent = make_agent(env)
+    assert all(isinstance(inner, SnapshotEnvWrapper) for inner in env.envs)
+    assert agent.get_env() is env
+
+
+def test_an_environment_that_moved_on_is_noticed(make_agent):
+    agent = make_agent("Pendulum-v1").learn(30)
+    agent.get_env().step(np.zeros((1, 1), dtype=np.float32))
+    with pytest.raises(ValueError, match="present states"):
+        agent._sample_action(0)

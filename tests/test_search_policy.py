@@ -1,0 +1,177 @@
+"""Acting with search with any trained agent."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from sb3_contrib import TQC
+from stable_baselines3 import DDPG, PPO, SAC, TD3
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize, sync_envs_normalization
+
+from sb3_mcbs import MCBSTD3, SearchPolicy, SearchSettings, SnapshotEnvWrapper
+from tests.conftest import SMALL_SEARCH, snapshot_vec_env
+
+
+@pytest.mark.parametrize("cls", [TD3, DDPG, SAC, TQC, MCBSTD3])
+def test_every_agent(make_agent, cls):
+    agent = make_agent(cls=cls).learn(40)
+    env = make_vec_env("Pendulum-v1", 1, seed=1)
+    policy = SearchPolicy(agent, env, seed=0, **SMALL_SEARCH)
+    mean, _ = evaluate_policy(policy, env, n_eval_episodes=1)
+    assert -2000 < mean < 0
+    assert policy.last_result.simulated_steps == 3 + 6
+
+
+@pytest.mark.parametrize("cls", [TD3, SAC, TQC])
+def test_critics_and_actor_are_the_agents(make_agent, cls):
+    """Depth 0 ranks by the critic: compare with the networks asked directly."""
+    import torch as th
+
+    agent = make_agent(cls=cls)
+    env = make_vec_env("Pendulum-v1", 1, seed=1)
+    policy = SearchPolicy(agent, env, seed=0, beam_width=5, rollout_depth=0)
+    observation = env.reset()
+    policy.predict(observation)
+    result = policy.last_result
+    with th.no_grad():
+        repeated = th.as_tensor(np.repeat(observation, 5, axis=0))
+        estimates = agent.critic(repeated, th.as_tensor(result.candidates[0]))
+        if cls is TQC:
+            expected = estimates.mean(dim=(1, 2))
+        else:
+            expected = th.cat(estimates, dim=1).min(dim=1).values
+    np.testing.assert_allclose(result.values[0], expected.numpy(), rtol=1e-5)
+    mean_action = agent.predict(observation, deterministic=True)[0] / 2
+    np.testing.assert_allclose(result.candidates[0].mean(), mean_action.item(), atol=0.2)
+
+
+def test_search_beats_a_bad_actor():
+    """With a known reward even an untrained agent acts better by looking ahead."""
+    env = make_vec_env("HalfCheetah-v5", 1, seed=0)
+    agent = TD3("MlpPolicy", env, seed=0, policy_kwargs=dict(net_arch=[16]), device="cpu", buffer_size=10)
+    plain, _ = evaluate_policy(agent, env, n_eval_episodes=1)
+    settings = dict(beam_width=24, rollout_depth=4, n_simulations=1, beam_noise=0.6)
+    searched, _ = evaluate_policy(SearchPolicy(agent, env, seed=0, **settings), env, n_eval_episodes=1)
+    assert searched > plain + 100
+
+
+def test_seed_decides_the_actions(make_agent):
+    agent = make_agent()
+
+    def actions(seed):
+        env = make_vec_env("Pendulum-v1", 1, seed=3)
+        policy = SearchPolicy(agent, env, seed=seed)
+        observation, taken = env.reset(), []
+        for _ in range(5):
+            action, _ = policy.predict(observation, deterministic=True)
+            observation, *_ = env.step(action)
+            taken.append(action)
+        return np.array(taken)
+
+    np.testing.assert_array_equal(actions(1), actions(1))
+    assert not np.array_equal(actions(1), actions(2))
+
+
+def test_several_environments_and_worker_processes(make_agent):
+    agent = make_agent("HalfCheetah-v5")
+    taken = []
+    for vec_env_cls in (None, SubprocVecEnv):
+        env = snapshot_vec_env("HalfCheetah-v5", 2, vec_env_cls=vec_env_cls)
+        policy = SearchPolicy(agent, env, seed=0)
+        observation = env.reset()
+        action, _ = policy.predict(observation)
+        assert action.shape == (2, 6)
+        observation, *_ = env.step(action)
+        taken.append(policy.predict(observation)[0])
+        env.close()
+    np.testing.assert_array_equal(*taken)
+
+
+def test_settings_default_to_the_agents(make_agent):
+    env = make_vec_env("Pendulum-v1", 1)
+    agent = make_agent(beam_width=5)
+    assert SearchPolicy(agent, env).settings == agent.search_settings
+    assert SearchPolicy(agent, env, rollout_depth=1).settings.beam_width == 5
+    assert SearchPolicy(make_agent(cls=TD3), env).settings == SearchSettings()
+    with pytest.raises(TypeError, match="beam_with"):
+        SearchPolicy(agent, env, beam_with=3)
+
+
+def test_gym_environment(make_agent):
+    agent = make_agent()
+    with pytest.raises(TypeError, match="SnapshotEnvWrapper outermost"):
+        SearchPolicy(agent, gym.make("Pendulum-v1"))
+    env = SnapshotEnvWrapper(gym.make("Pendulum-v1"))
+    policy = SearchPolicy(agent, env, seed=0)
+    observation, _ = env.reset(seed=0)
+    action, _ = policy.predict(observation)
+    assert action.shape == (1,)
+    env.step(action)
+
+
+def test_agents_without_critics_are_refused():
+    env = make_vec_env("Pendulum-v1", 1)
+    with pytest.raises(TypeError, match="PPO"):
+        SearchPolicy(PPO("MlpPolicy", env, n_steps=8, batch_size=8, device="cpu"), env)
+
+
+def test_observations_of_another_moment_are_refused(make_agent):
+    env = make_vec_env("Pendulum-v1", 1)
+    policy = SearchPolicy(make_agent(), env)
+    observation = env.reset()
+    env.step(np.zeros((1, 1), dtype=np.float32))
+    with pytest.raises(ValueError, match="present states"):
+        policy.predict(observation)
+
+
+def test_search_leaves_the_environment_alone(make_agent):
+    env = make_vec_env("Hopper-v5", 1, seed=0)
+    agent = make_agent("Hopper-v5")
+    policy = SearchPolicy(agent, env, seed=0)
+    observation = env.reset()
+    before = env.envs[0].snapshot()
+    action, _ = policy.predict(observation)
+    plain = [env.step(action) for _ in range(3)]
+    env.envs[0].restore(before)
+    again = [env.step(action) for _ in range(3)]
+    for left, right in zip(plain, again, strict=True):
+        np.testing.assert_array_equal(left[0], right[0])
+        np.testing.assert_array_equal(left[1], right[1])
+
+
+class TestRewardScale:
+    """The critics' scale on an evaluation environment whose ``norm_reward`` is off."""
+
+    def envs(self):
+        training, evaluation = (VecNormalize(make_vec_env("Hopper-v5", 1, seed=0)) for _ in range(2))
+        evaluation.training = evaluation.norm_reward = False
+        return training, evaluation
+
+    def test_is_that_of_the_training_environment(self, make_agent):
+        training, evaluation = self.envs()
+        agent = make_agent(training).learn(40)
+        sync_envs_normalization(training, evaluation)
+        policy = SearchPolicy(agent, evaluation)
+        assert policy.searcher.view.reward_normalizer is training
+        scaled = policy.searcher.view.scale_reward(np.array([1.0]))
+        assert scaled[0] == pytest.approx(1 / np.sqrt(training.ret_rms.var + training.epsilon))
+        assert training.norm_reward and not evaluation.norm_reward
+
+    def test_is_assumed_from_statistics_and_said(self, make_agent, tmp_path):
+        training, evaluation = self.envs()
+        agent = make_agent(training).learn(40)
+        agent.save(tmp_path / "agent")
+        sync_envs_normalization(training, evaluation)
+        alone = MCBSTD3.load(tmp_path / "agent", device="cpu")
+        with pytest.warns(UserWarning, match="normalize_reward=True or False"):
+            policy = SearchPolicy(alone, evaluation)
+        assert policy.searcher.view.reward_normalizer is evaluation
+        assert SearchPolicy(alone, evaluation, normalize_reward=False).searcher.view.reward_normalizer is None
+
+    def test_raw_rewards_stay_raw(self, make_agent):
+        env = VecNormalize(make_vec_env("Hopper-v5", 1, seed=0), norm_reward=False)
+        agent = make_agent(env).learn(40)
+        assert agent._searcher.view.reward_normalizer is None
+        agent.set_env(env)
+        assert agent._searcher.view.reward_normalizer is None

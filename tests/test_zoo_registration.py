@@ -1,0 +1,158 @@
+"""How ``mcbs_td3`` gets into RL Zoo: by the import hook, and explicitly."""
+
+import os
+import subprocess
+import sys
+import time
+import types
+import warnings
+from pathlib import Path
+
+import pytest
+
+import _sb3_mcbs_hook as hook
+from sb3_mcbs.zoo import register, registration
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def python(code: str, *options: str, **environment: str) -> str:
+    result = subprocess.run(
+        [sys.executable, *options, "-c", code],
+        capture_output=True,
+        text=True,
+        env={**os.environ, hook.SWITCH: "0", "PYTHONPATH": str(ROOT), **environment},
+        check=False,
+    )
+    assert result.returncode == 0, result.stderr
+    return result.stdout.strip()
+
+
+def test_register_fills_rl_zoos_tables_and_can_be_repeated() -> None:
+    register()
+    register()
+    import rl_zoo3.enjoy
+    import rl_zoo3.exp_manager
+    import rl_zoo3.hyperparams_opt
+    import rl_zoo3.train
+
+    from sb3_mcbs import MCBSTD3
+    from sb3_mcbs.zoo.manager import MCBSExperimentManager
+
+    assert rl_zoo3.ALGOS["mcbs_td3"] is MCBSTD3
+    assert rl_zoo3.train.ALGOS is rl_zoo3.ALGOS
+    assert rl_zoo3.exp_manager.HYPERPARAMS_SAMPLER["mcbs_td3"].__module__ == "sb3_mcbs.zoo.sampler"
+    assert rl_zoo3.hyperparams_opt.HYPERPARAMS_CONVERTER["mcbs_td3"].__module__ == "sb3_mcbs.zoo.sampler"
+    for module in (rl_zoo3.exp_manager, rl_zoo3.train, rl_zoo3.enjoy):
+        assert module.ExperimentManager is MCBSExperimentManager
+    assert MCBSExperimentManager.__base__.__module__ == "rl_zoo3.exp_manager"
+    assert MCBSExperimentManager.__base__ is not MCBSExperimentManager
+
+
+def test_register_reaches_commands_that_were_imported_before() -> None:
+    register()
+    import rl_zoo3.train
+
+    from sb3_mcbs.zoo.manager import MCBSExperimentManager
+
+    rl_zoo3.train.ExperimentManager = MCBSExperimentManager.__base__
+    register()
+    assert rl_zoo3.train.ExperimentManager is MCBSExperimentManager
+
+
+REPORT = """
+import sys
+{first}
+import rl_zoo3.train
+import rl_zoo3.exp_manager as e, rl_zoo3.hyperparams_opt as o
+print("mcbs_td3" in rl_zoo3.ALGOS, "mcbs_td3" in o.HYPERPARAMS_SAMPLER, "mcbs_td3" in o.HYPERPARAMS_CONVERTER,
+      rl_zoo3.train.ExperimentManager.__name__, e.EvalCallback.__name__, e.TrialEvalCallback.__name__)
+"""
+REGISTERED = "True True True MCBSExperimentManager SearchEvalCallback SearchTrialEvalCallback"
+
+
+@pytest.mark.parametrize(
+    "first",
+    [
+        "import _sb3_mcbs_hook; assert not any(m.startswith('sb3_mcbs') for m in sys.modules)",
+        "import _sb3_mcbs_hook, sb3_mcbs.zoo.manager",
+    ],
+    ids=["rl_zoo3 first", "our manager first"],
+)
+def test_hook_registers_in_every_import_order(first: str) -> None:
+    assert python(REPORT.format(first=first), "-W", "error::RuntimeWarning") == REGISTERED
+
+
+def test_hook_can_be_switched_off() -> None:
+    code = REPORT.format(first="import _sb3_mcbs_hook")
+    expected = "False False False ExperimentManager EvalCallback TrialEvalCallback"
+    assert python(code, **{hook.SWITCH: "1"}) == expected
+
+
+def test_hook_imports_nothing_that_an_interpreter_has_not_loaded() -> None:
+    code = f"import sys; sys.path.insert(0, {str(ROOT)!r}); before = set(sys.modules); import _sb3_mcbs_hook"
+    assert python(f"{code}; print(set(sys.modules) - before)", "-I") == "{'_sb3_mcbs_hook'}"
+
+
+def test_hook_takes_less_than_a_millisecond() -> None:
+    code = compile(Path(hook.__file__).read_text(), hook.__file__, "exec")
+    finders = list(sys.meta_path)
+    seconds = []
+    try:
+        for _ in range(20):
+            start = time.perf_counter()
+            exec(code, {"__name__": "_sb3_mcbs_hook"})
+            seconds.append(time.perf_counter() - start)
+    finally:
+        sys.meta_path[:] = finders
+    assert min(seconds) < 1e-3
+
+
+def test_hook_is_put_in_place_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "meta_path", [])
+    monkeypatch.delenv(hook.SWITCH, raising=False)
+    hook.install()
+    hook.install()
+    assert len(sys.meta_path) == 1
+    monkeypatch.setattr(sys, "meta_path", [])
+    monkeypatch.setenv(hook.SWITCH, "1")
+    hook.install()
+    assert sys.meta_path == []
+
+
+@pytest.fixture
+def watched_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    (tmp_path / "watched_by_the_hook.py").write_text("value = 1\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(hook, "WATCHED", ("watched_by_the_hook",))
+    monkeypatch.setattr(sys, "meta_path", [hook.ZooFinder(), *sys.meta_path])
+    monkeypatch.delitem(sys.modules, "watched_by_the_hook", raising=False)
+    return "watched_by_the_hook"
+
+
+def test_hook_announces_a_module_after_it_ran(watched_module: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[int] = []
+    monkeypatch.setattr(registration, "after_import", lambda module: seen.append(module.value))
+    module = __import__(watched_module)
+    assert seen == [1]
+    # Other tools still get what they ask of a module's loader.
+    assert module.__loader__.get_source(watched_module) == "value = 1\n"
+
+
+def test_failing_registration_warns_with_the_cause_and_rl_zoo_still_imports(
+    watched_module: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(module: types.ModuleType) -> None:
+        raise ImportError("libmujoco is missing")
+
+    monkeypatch.setattr(registration, "after_import", fail)
+    with pytest.warns(RuntimeWarning, match=rf"ImportError: libmujoco is missing.*{hook.SWITCH}=1"):
+        module = __import__(watched_module)
+    assert module.value == 1
+
+
+def test_other_modules_are_left_alone() -> None:
+    assert hook.ZooFinder().find_spec("json") is None
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        registration.after_import(types.ModuleType("rl_zoo3.wrappers"))

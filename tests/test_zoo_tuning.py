@@ -1,0 +1,154 @@
+"""What ``-optimize`` tunes for ``mcbs_td3``, and what its objective is."""
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import optuna
+import pytest
+
+from sb3_mcbs import SearchPolicy
+from sb3_mcbs.search import SearchSettings
+from sb3_mcbs.zoo import sampler, train
+from tests.zoo_helpers import TINY, zoo_train
+
+SEARCH = {"beam_width": 6, "rollout_depth": 3, "n_simulations": 5, "beam_noise": 0.1}
+TD3 = {
+    "one_minus_gamma": 0.02,
+    "batch_size_pow": 6,
+    "learning_rate": 1e-3,
+    "train_freq": 4,
+    "tau": 0.01,
+    "noise_type": "normal",
+    "noise_std": 0.2,
+    "net_arch": "small",
+}
+NO_HER = {"using_her_replay_buffer": False, "her_kwargs": {}}
+
+
+def sample(params: dict[str, Any]) -> dict[str, Any]:
+    return sampler.sample_mcbs_td3_params(optuna.trial.FixedTrial(params), 1, 1, dict(NO_HER))
+
+
+def test_only_the_search_is_tuned_by_default(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(sampler.SWITCH, raising=False)
+    assert sample(SEARCH) == SEARCH
+    assert sampler.convert_mcbs_td3_params(SEARCH) == SEARCH
+
+
+@pytest.mark.parametrize("noise_type", ["normal", "ornstein-uhlenbeck", None])
+def test_everything_is_tuned_when_asked(noise_type: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(sampler.SWITCH, "all")
+    params = {**SEARCH, **TD3, "noise_type": noise_type}
+    sampled = sample(params)
+    assert sampled["gamma"] == 0.98 and sampled["batch_size"] == 64 and sampled["beam_width"] == 6
+    converted = sampler.convert_mcbs_td3_params(params)
+    noise = {key: converted.pop(key, None) for key in ("noise_type", "noise_std")}
+    # RL Zoo makes the noise from its name and scale; without a name the file's noise stays, as in the trial.
+    assert noise == ({"noise_type": None, "noise_std": None} if noise_type is None else
+                     {"noise_type": noise_type, "noise_std": 0.2})  # fmt: skip
+    sampled_noise = sampled.pop("action_noise", None)
+    assert (sampled_noise is None) == (noise_type is None)
+    assert converted == sampled
+
+
+def test_unknown_scope_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(sampler.SWITCH, "td3")
+    with pytest.raises(ValueError, match="SB3_MCBS_TUNE must be one of search, all, got 'td3'"):
+        sample(SEARCH)
+
+
+@pytest.mark.parametrize(
+    "change", [{"rollout_depth": 0}, {"beam_width": 18, "rollout_depth": 6, "n_simulations": 10}]
+)
+def test_invalid_combinations_are_pruned_in_the_sampler(change: dict[str, int]) -> None:
+    with pytest.raises(optuna.TrialPruned, match="rollout_depth"):
+        sample({**SEARCH, **change})
+
+
+def test_every_other_combination_is_accepted_by_the_constructor() -> None:
+    accepted = 0
+    for width in sampler.BEAM_WIDTHS:
+        for depth in sampler.ROLLOUT_DEPTHS:
+            for n_simulations in sampler.N_SIMULATIONS:
+                params = {"beam_width": width, "rollout_depth": depth, "n_simulations": n_simulations}
+                try:
+                    SearchSettings(**sample({**params, "beam_noise": sampler.BEAM_NOISE[1]}))
+                    accepted += 1
+                except optuna.TrialPruned:
+                    assert depth == 0 or width * depth * n_simulations > sampler.MAX_SIMULATED_STEPS
+    assert accepted > 50
+
+
+WORDS = ["-optimize", "-n", "300", "--n-evaluations", "1", "--eval-episodes", "1", "--no-optim-plots",
+         "--study-name", "tiny", "--storage", "study.log", "--num-threads", "1"]  # fmt: skip
+PARAMS = ["-params", *TINY, "n_threads:1"]
+
+
+def load_study(path: Path) -> optuna.Study:
+    backend = optuna.storages.journal.JournalFileBackend(str(path))
+    return optuna.load_study(study_name="tiny", storage=optuna.storages.JournalStorage(backend))
+
+
+def test_objective_is_the_actor_with_search(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[int] = []
+    original = SearchPolicy.predict
+
+    def predict(self: SearchPolicy, *args: Any, **kwargs: Any) -> Any:
+        calls.append(self.settings.beam_width)
+        return original(self, *args, **kwargs)
+
+    monkeypatch.setattr(SearchPolicy, "predict", predict)
+    monkeypatch.setattr(sampler, "ROLLOUT_DEPTHS", (1,))
+    monkeypatch.setattr(sampler, "N_SIMULATIONS", (1,))
+    monkeypatch.setattr(sampler, "BEAM_WIDTHS", (2,))
+    zoo_train(monkeypatch, tmp_path, "mcbs_td3", *WORDS, "--n-trials", "2", "--seed", "1", *PARAMS)
+    study = load_study(tmp_path / "study.log")
+    assert calls == [2] * 400  # an episode for each trial
+    assert [trial.state.name for trial in study.trials] == ["COMPLETE"] * 2
+    for trial in study.trials:
+        assert trial.user_attrs["search/decisions"] == 200
+        assert trial.user_attrs["search/simulated_steps"] == 400
+        assert np.isfinite(trial.value)
+    assert len(list((tmp_path / "logs" / "mcbs_td3").glob("report_*.csv"))) == 1
+
+    # RL Zoo takes trial number 0 for no trial at all.
+    best = study.trials[0].params["beam_noise"]
+    zoo_train(
+        monkeypatch, tmp_path, "mcbs_td3", "-n", "100", "--eval-freq", "-1", "--storage", "study.log",
+        "--study-name", "tiny", "--trial-id", "0", *PARAMS,
+    )  # fmt: skip
+    from sb3_mcbs.zoo.repeat import load_run
+
+    runs = sorted((tmp_path / "logs" / "mcbs_td3").glob("*/Pendulum-v1/config.yml"))
+    config, _ = load_run(runs[-1].parents[1])
+    assert config["beam_noise"] == best and config["beam_width"] == 2
+
+
+def test_invalid_combinations_do_not_end_a_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sampler, "ROLLOUT_DEPTHS", (0,))
+    monkeypatch.setattr(sampler, "N_SIMULATIONS", (1, 5))
+    words = [*WORDS, "--n-trials", "4", "--sampler", "random", "--seed", "0", *PARAMS]
+    zoo_train(monkeypatch, tmp_path, "mcbs_td3", *words)
+    trials = load_study(tmp_path / "study.log").trials
+    states = {(trial.params["n_simulations"], trial.state.name) for trial in trials}
+    assert len(trials) == 4
+    assert states == {(1, "COMPLETE"), (5, "PRUNED")}
+
+
+@pytest.mark.slow
+def test_two_workers_share_one_study(tmp_path: Path) -> None:
+    """The recipe of docs/tuning.md."""
+    command = [sys.executable, "-m", train.__name__, "--algo", "mcbs_td3", "--env", "Pendulum-v1", *WORDS]
+    workers = [
+        subprocess.Popen([*command, "--n-trials", "3", "--seed", str(seed), *PARAMS], cwd=tmp_path)
+        for seed in (1, 2)
+    ]
+    assert [worker.wait(300) for worker in workers] == [0, 0]
+    trials = load_study(tmp_path / "study.log").trials
+    assert len(trials) == 6
+    assert len({tuple(sorted(trial.params.items())) for trial in trials}) == 6
+    complete = [trial for trial in trials if trial.state.name == "COMPLETE"]
+    assert complete and all(trial.user_attrs["search/decisions"] > 0 for trial in complete)
