@@ -40,4 +40,6 @@ class LineWorld(ForwardModel):
         if self.spread:
             self.x = self.x + self.spread * self.rng.standard_normal(self.n_rows)
         observations = self.x[:, None].copy()
-        return Transition(observations, -self.x**2, np.abs(self.x) > self.limit, actions[:, 0] <= self.bad_action)
+        return Transition(
+            observations, -(self.x**2), np.abs(self.x) > self.limit, actions[:, 0] <= self.bad_action
+        )

@@ -35,7 +35,9 @@ class Reference:
         self.env_step, self.restore = env_step, restore
         self.policy, self.critics, self.gamma = policy, critics, gamma
 
-    def choose(self, observation, beam_noise: np.ndarray, rollout_noise: np.ndarray) -> tuple[int, np.ndarray, list]:
+    def choose(
+        self, observation, beam_noise: np.ndarray, rollout_noise: np.ndarray
+    ) -> tuple[int, np.ndarray, list]:
         """Steps 1 to 3.
 
         :param observation: s_t

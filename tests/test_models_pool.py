@@ -4,6 +4,7 @@ import logging
 import random
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -15,7 +16,7 @@ from gymnasium.wrappers import (
     TimeLimit,
 )
 
-from sb3_mcbs.models import EnvPoolModel, LocalEnvironments, MujocoBatchModel
+from sb3_mcbs.models import EnvPoolModel, ForwardModelError, LocalEnvironments, MujocoBatchModel
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 
 RNG = np.random.default_rng(0)
@@ -170,6 +171,10 @@ def test_a_row_that_terminated_stays_terminated() -> None:
     np.testing.assert_array_equal(after.observations["age"], [4, 4, 5])
     np.testing.assert_array_equal(after.rewards[:2], 0)
     assert after.valid.all()
+    last_place = after.observations["place"][0].copy()
+    # The copy behind the row that is dropped serves another row from now on.
+    model.select(np.array([1, 2, 2, 2]))
+    np.testing.assert_array_equal(model.step(small_actions(4)).observations["place"][0], last_place)
 
 
 @pytest.mark.parametrize(("action", "message"), [(1.0, "the point broke"), (-1.0, None)])
@@ -189,19 +194,33 @@ def test_errors_and_nan_make_one_row_invalid(
     np.testing.assert_array_equal(model.step(small_actions(3)).valid, [True, False, False])
     start(model, 3)
     assert model.step(small_actions(3)).valid.all(), "copies are of use again after new roots"
+    start(model, 3)
+    assert not model.step(actions).valid.all()
+    assert len(caplog.records) == (1 if message else 0), "one warning is enough"
 
 
 def test_a_mujoco_copy_that_resets_itself_is_invalid() -> None:
     env = SnapshotEnvWrapper(gym.make("HalfCheetah-v5"))
     env.reset(seed=0)
     model = EnvPoolModel(LocalEnvironments([env]))
+    root = model.read_roots([0])
+    env.unwrapped.data.qvel[0] = 1e11
+    bad_root = model.read_roots([0])
     for _ in range(2):
+        model.set_roots(root + bad_root, np.array([0, 1, 1]), RNG)
+        for _ in range(2):
+            found = model.step(np.zeros((3, 6), dtype=np.float32))
+            np.testing.assert_array_equal(found.valid, [True, False, False])
+            assert np.isfinite(found.observations).all()
+
+
+def test_what_the_environment_went_through_does_not_count() -> None:
+    env = SnapshotEnvWrapper(gym.make("HalfCheetah-v5"))
+    env.reset(seed=0)
+    env.unwrapped.data.warning.number[:] = 1
+    for model in (EnvPoolModel(LocalEnvironments([env])), MujocoBatchModel(LocalEnvironments([env]))):
         start(model, 2)
-        actions = np.zeros((2, 6), dtype=np.float32)
-        actions[0] = np.nan
-        found = model.step(actions)
-        np.testing.assert_array_equal(found.valid, [False, True])
-    assert np.isfinite(found.observations).all()
+        assert model.step(np.zeros((2, 6), dtype=np.float32)).valid.all()
 
 
 @pytest.mark.parametrize("noise", ["own", "numpy", "python"])
@@ -261,6 +280,32 @@ def test_copies_carry_what_was_edited() -> None:
         start(model, 1)
         predicted = model.step(action).observations[0]
         np.testing.assert_array_equal(predicted, env.step(action[0])[0])
+
+
+def test_an_environment_that_exchanges_its_simulator() -> None:
+    env = SnapshotEnvWrapper(gym.make("Swimmer-v5"))
+    env.reset(seed=0)
+    environments = LocalEnvironments([env])
+    pool, batch = EnvPoolModel(environments), MujocoBatchModel(environments, n_threads=1)
+    start(pool, 2)
+    base, action = env.unwrapped, np.full((1, 2), 0.7, dtype=np.float32)
+    spec = mujoco.MjSpec.from_file(base.fullpath)
+    spec.body("torso").add_site(name="a mark that was not there")
+    spec.bodies[2].add_joint(name="one more", axis=[0, 0, 1], damping=1)
+    base.model = spec.compile()
+    base.data = mujoco.MjData(base.model)
+    base.init_qpos, base.init_qvel = base.data.qpos.copy(), base.data.qvel.copy()
+    env.reset(seed=1)
+    with pytest.raises(ForwardModelError, match=r"another MuJoCo model .*call refresh"):
+        batch.read_roots([0])
+    batch.refresh()
+    predicted = []
+    for model in (pool, batch):
+        start(model, 1)
+        predicted.append(model.step(action).observations[0])
+    observation = env.step(action[0])[0]
+    for ours in predicted:
+        np.testing.assert_array_equal(ours, observation)
 
 
 def test_roots_of_several_environments() -> None:

@@ -110,6 +110,15 @@ def test_no_look_ahead_in_the_middle_of_a_step(workers: SubprocVecEnv) -> None:
     workers.step_wait()
 
 
+def test_closing_after_the_workers_have_ended() -> None:
+    vec_env = SubprocVecEnv([lambda: SnapshotEnvWrapper(gym.make("Pendulum-v1"))], start_method="fork")
+    model = make_forward_model(WorkerEnvironments(vec_env))
+    vec_env.close()
+    with pytest.raises(ForwardModelError, match="was closed"):
+        model.read_roots([0])
+    model.close()
+
+
 def test_an_environment_without_the_wrapper_is_refused() -> None:
     vec_env = SubprocVecEnv([lambda: gym.make("Pendulum-v1")], start_method="fork")
     with pytest.raises(ForwardModelError, match=r"env_wrapper: sb3_mcbs\.SnapshotEnvWrapper"):

@@ -148,7 +148,7 @@ def test_installation_registers_in_any_folder(installed: Environment, tmp_path: 
 def test_rl_zoos_own_commands_work_in_any_folder(installed: Environment, tmp_path: Path) -> None:
     words = ["--algo", "mcbs_td3", "--env", "Pendulum-v1", "-f", "logs"]
     tiny = ["learning_starts:100", "batch_size:16", "beam_width:2", "n_simulations:1"]
-    short = ["-n", "240", "--eval-freq", "120", "--eval-episodes", "1", "-params", *tiny]
+    short = ["-n", "240", "--eval-freq", "120", "--eval-episodes", "2", "-params", *tiny]
     output = installed.run("-m", "rl_zoo3.train", *words, *short, cwd=tmp_path)
     assert "Evaluating with search" in output and "Eval of the actor alone" in output
     output = installed.run("-m", "rl_zoo3.enjoy", *words, "--no-render", "-n", "200", cwd=tmp_path)

@@ -68,7 +68,9 @@ def test_same_values_and_choice(env_id, kwargs, kind, steps):
         observations = walk(vec_env, steps + trial, rng)
         roots = searcher.model.read_roots([0])
         noise = draw_noise(rng, settings, 1, vec_env.action_space.shape[0])
-        result = beam_search(searcher.model, roots, observations, searcher.agent_functions(), settings, noise, rng)
+        result = beam_search(
+            searcher.model, roots, observations, searcher.agent_functions(), settings, noise, rng
+        )
         reference = reference_for(agent, vec_env.envs[0])
         chosen, values, rewards = reference.choose(observations[0], noise.beam[0], noise.rollout[:, 0])
         np.testing.assert_allclose(result.values[0], values, rtol=1e-5, atol=1e-5)
@@ -90,7 +92,8 @@ def test_rewards_are_exact():
     # A policy that is the same constant in both makes the actions bit-identical, whatever the batch size.
     constant = np.zeros((1, vec_env.action_space.shape[0]), dtype=np.float32)
     functions = searcher.agent_functions()._replace(
-        policy=lambda obs: np.repeat(constant, len(obs), axis=0), value=lambda obs, actions: np.zeros(len(actions))
+        policy=lambda obs: np.repeat(constant, len(obs), axis=0),
+        value=lambda obs, actions: np.zeros(len(actions)),
     )
     roots, noise = searcher.model.read_roots([0]), draw_noise(rng, settings, 1, constant.shape[1])
     result = beam_search(searcher.model, roots, observations, functions, settings, noise, rng)
@@ -113,7 +116,9 @@ def test_normalised_observations_and_rewards():
     statistics = vec_env.obs_rms.mean.copy(), vec_env.ret_rms.var, vec_env.returns.copy()
     observations = vec_env.get_original_obs()
     roots, noise = searcher.model.read_roots([0]), draw_noise(rng, settings, 1, 3)
-    result = beam_search(searcher.model, roots, observations, searcher.agent_functions(), settings, noise, rng)
+    result = beam_search(
+        searcher.model, roots, observations, searcher.agent_functions(), settings, noise, rng
+    )
 
     reference = reference_for(agent, vec_env.venv.envs[0])
     plain_step = reference.env_step
@@ -123,7 +128,9 @@ def test_normalised_observations_and_rewards():
         return vec_env.normalize_obs(observation), vec_env.normalize_reward(np.array([reward]))[0], done
 
     reference.env_step = normalised_step
-    chosen, values, _ = reference.choose(vec_env.normalize_obs(observations[0]), noise.beam[0], noise.rollout[:, 0])
+    chosen, values, _ = reference.choose(
+        vec_env.normalize_obs(observations[0]), noise.beam[0], noise.rollout[:, 0]
+    )
     np.testing.assert_allclose(result.values[0], values, rtol=1e-5)
     assert result.chosen[0] == chosen
     np.testing.assert_array_equal(vec_env.obs_rms.mean, statistics[0])

@@ -11,7 +11,13 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecMonitor, VecNormalize
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    SubprocVecEnv,
+    VecFrameStack,
+    VecMonitor,
+    VecNormalize,
+)
 
 from sb3_mcbs import MCBSTD3, SnapshotEnvWrapper
 from tests.conftest import assert_same_parameters, parameters_of, snapshot_vec_env
@@ -62,7 +68,7 @@ def test_processes_and_one_process_train_alike(make_agent):
 
 def test_workers_that_are_not_wrapped_are_refused(make_agent):
     env = make_vec_env("Pendulum-v1", 1, vec_env_cls=SubprocVecEnv)
-    with pytest.raises(ValueError, match="env_wrapper: sb3_mcbs.SnapshotEnvWrapper"):
+    with pytest.raises(ValueError, match=r"env_wrapper: sb3_mcbs\.SnapshotEnvWrapper"):
         make_agent(env)
     env.close()
 
@@ -73,7 +79,9 @@ def test_unknown_vectorized_wrapper_is_refused(make_agent):
 
 
 def test_same_seed_same_run_and_threads_change_nothing(make_agent):
-    one, two, other = (make_agent("Hopper-v5", seed=s, n_threads=n).learn(60) for s, n in [(3, 1), (3, 2), (4, 1)])
+    one, two, other = (
+        make_agent("Hopper-v5", seed=s, n_threads=n).learn(60) for s, n in [(3, 1), (3, 2), (4, 1)]
+    )
     assert_same_parameters(one, two)
     np.testing.assert_array_equal(one.replay_buffer.actions[:60], two.replay_buffer.actions[:60])
     assert not np.array_equal(one.replay_buffer.actions[:60], other.replay_buffer.actions[:60])
@@ -114,7 +122,9 @@ def test_searched_action_is_executed_and_stored_as_it_is(make_agent):
 def test_action_noise_after_search_is_an_option(make_agent):
     noise = NormalActionNoise(np.zeros(1), 5.0 * np.ones(1))
     quiet = make_agent(action_noise=noise).learn(40).replay_buffer.actions[20:40]
-    loud = make_agent(action_noise=noise, action_noise_after_search=True).learn(40).replay_buffer.actions[20:40]
+    loud = (
+        make_agent(action_noise=noise, action_noise_after_search=True).learn(40).replay_buffer.actions[20:40]
+    )
     assert np.mean(np.abs(loud) == 1) > 0.5 > np.mean(np.abs(quiet) == 1)
 
 
@@ -141,7 +151,6 @@ def test_an_edited_environment_is_followed(make_agent, tmp_path):
     model.body_mass[:] *= 1.3
     with pytest.warns(UserWarning, match="edited"):
         agent.learn(10, reset_num_timesteps=False)
-    agent._searcher.settings  # the batch was kept
     assert agent._searcher.model.kind == "mujoco"
     agent.logger.dump(1)
     agent.learn(20, reset_num_timesteps=False)

@@ -15,7 +15,7 @@ def policy(observations):
 
 
 def critics(observation, action):
-    return [-float(observation[0]) ** 2 - float(action[0]), -abs(float(observation[0])) + 0.1]
+    return [-(float(observation[0]) ** 2) - float(action[0]), -abs(float(observation[0])) + 0.1]
 
 
 def value(observations, actions):
@@ -38,7 +38,7 @@ def reference_values(model, root, noise, env):
 
     def env_step(action):
         world["x"] += float(action[0])
-        return np.array([world["x"]]), -world["x"] ** 2, abs(world["x"]) > model.limit
+        return np.array([world["x"]]), -(world["x"] ** 2), abs(world["x"]) > model.limit
 
     reference = Reference(env_step, restore, lambda obs: policy(obs), critics, GAMMA)
     return reference.choose(np.array([float(root)]), noise.beam[env], noise.rollout[:, env])

@@ -37,10 +37,8 @@ def test_critics_and_actor_are_the_agents(make_agent, cls):
     with th.no_grad():
         repeated = th.as_tensor(np.repeat(observation, 5, axis=0))
         estimates = agent.critic(repeated, th.as_tensor(result.candidates[0]))
-        if cls is TQC:
-            expected = estimates.mean(dim=(1, 2))
-        else:
-            expected = th.cat(estimates, dim=1).min(dim=1).values
+        minimum = cls is not TQC
+        expected = th.cat(estimates, dim=1).min(dim=1).values if minimum else estimates.mean(dim=(1, 2))
     np.testing.assert_allclose(result.values[0], expected.numpy(), rtol=1e-5)
     mean_action = agent.predict(observation, deterministic=True)[0] / 2
     np.testing.assert_allclose(result.candidates[0].mean(), mean_action.item(), atol=0.2)
@@ -175,3 +173,26 @@ class TestRewardScale:
         assert agent._searcher.view.reward_normalizer is None
         agent.set_env(env)
         assert agent._searcher.view.reward_normalizer is None
+
+
+def test_search_draws_nothing_from_global_generators(make_agent):
+    import random
+
+    import torch as th
+
+    env = make_vec_env("Hopper-v5", 1, seed=0)
+    agent = make_agent("Hopper-v5", cls=SAC)
+    observation = env.reset()
+
+    def generators():
+        state = np.random.get_state()
+        return (
+            random.getstate(),
+            [np.asarray(part).tobytes() for part in state[1:]],
+            th.get_rng_state().numpy().tobytes(),
+        )
+
+    before = generators()
+    policy = SearchPolicy(agent, env, seed=0)
+    policy.predict(observation)
+    assert generators() == before

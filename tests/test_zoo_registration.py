@@ -90,7 +90,10 @@ def test_hook_can_be_switched_off() -> None:
 
 
 def test_hook_imports_nothing_that_an_interpreter_has_not_loaded() -> None:
-    code = f"import sys; sys.path.insert(0, {str(ROOT)!r}); before = set(sys.modules); import _sb3_mcbs_hook"
+    code = (
+        f"import sys; sys.path.insert(0, {str(ROOT)!r}); sys.modules.pop('_sb3_mcbs_hook', None);"
+        "before = set(sys.modules); import _sb3_mcbs_hook"
+    )
     assert python(f"{code}; print(set(sys.modules) - before)", "-I") == "{'_sb3_mcbs_hook'}"
 
 

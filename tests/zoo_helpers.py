@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch as th
 from stable_baselines3.common.monitor import load_results
 
 TINY = ["learning_starts:100", "policy_kwargs:dict(net_arch=[16])", "batch_size:16"]
@@ -21,7 +22,13 @@ def zoo_train(
     folder.mkdir(parents=True, exist_ok=True)
     monkeypatch.chdir(folder)
     monkeypatch.setattr(sys, "argv", ["rl_zoo3.train", "--algo", algo, "--env", env, *words])
-    train.main()
+    n_threads = th.get_num_threads()
+    # Small networks are faster on one thread, most of all where several test processes run.
+    th.set_num_threads(1)
+    try:
+        train.main()
+    finally:
+        th.set_num_threads(n_threads)
 
 
 def monitor_rewards(run_folder: Path) -> list[float]:

@@ -171,7 +171,9 @@ class MCBSTD3(TD3):
         # ``load`` sets attributes without calling the constructor, so settings are checked here.
         settings = self.search_settings
         if not isinstance(self.action_noise_after_search, bool):
-            raise TypeError(f"action_noise_after_search must be True or False, got {self.action_noise_after_search!r}.")
+            raise TypeError(
+                f"action_noise_after_search must be True or False, got {self.action_noise_after_search!r}."
+            )
         super()._setup_model()
         if self.search_rng is None:
             self.search_rng = np.random.default_rng(self.seed)
@@ -223,7 +225,7 @@ class MCBSTD3(TD3):
         result = self._searcher.search(self._last_obs, self.search_rng)
         self._record_decision(result, time.perf_counter() - start)
 
-        scaled_action = result.actions.reshape(-1, *self.action_space.shape)
+        scaled_action = result.actions.reshape(-1, *(self.action_space.shape or ()))
         if self.action_noise_after_search and action_noise is not None:
             noisy_action = np.clip(scaled_action + action_noise(), -1, 1).astype(scaled_action.dtype)
             return self.policy.unscale_action(noisy_action), noisy_action
@@ -256,7 +258,9 @@ class MCBSTD3(TD3):
         valid = result.chosen >= 0
         if valid.any() and np.isfinite(result.values[valid]).all():
             values = result.values[valid]
-            self.logger.record_mean("search/value_gain", float((values.max(axis=1) - values.mean(axis=1)).mean()))
+            self.logger.record_mean(
+                "search/value_gain", float((values.max(axis=1) - values.mean(axis=1)).mean())
+            )
             self.logger.record_mean("search/beam_std", float(values.std(axis=1).mean()))
         self.logger.record_mean("search/ms_per_decision", 1000 * seconds / n_envs)
         self.logger.record("search/decisions", self.n_decisions)

@@ -1,6 +1,7 @@
 """The networks of any trained SB3 off-policy agent as two functions on arrays."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -24,7 +25,9 @@ def check_agent(agent: OffPolicyAlgorithm) -> None:
     """
     if not isinstance(agent, SUPPORTED):
         names = ", ".join(cls.__name__ for cls in SUPPORTED)
-        raise TypeError(f"{type(agent).__name__} has no actor and Q-critics to search with; supported: {names}.")
+        raise TypeError(
+            f"{type(agent).__name__} has no actor and Q-critics to search with; supported: {names}."
+        )
     if not isinstance(agent.action_space, spaces.Box):
         raise ValueError(f"A search needs a continuous (Box) action space, got {agent.action_space}.")
 
@@ -35,12 +38,13 @@ def policy_function(agent: OffPolicyAlgorithm) -> Callable[[Observations], np.nd
     :param agent: a supported agent; its present networks are used at every call.
     :return: observations ``[rows, *obs_shape]`` -> float32 actions ``[rows, act_dim]`` in [-1, 1].
     """
+    policy_network: Any = agent.policy
     stochastic = isinstance(agent, SAC | TQC)
 
     def policy(observations: Observations) -> np.ndarray:
         with th.no_grad():
             tensor = obs_as_tensor(observations, agent.device)
-            actor = agent.policy.actor
+            actor = policy_network.actor
             actions = actor(tensor, deterministic=True) if stochastic else actor(tensor)
             return actions.cpu().numpy()
 
@@ -53,12 +57,13 @@ def value_function(agent: OffPolicyAlgorithm) -> Callable[[Observations, np.ndar
     :param agent: a supported agent; its present networks are used at every call.
     :return: observations ``[rows, *obs_shape]``, scaled actions ``[rows, act_dim]`` -> ``[rows]``.
     """
+    policy_network: Any = agent.policy
     quantiles = isinstance(agent, TQC)
 
     def value(observations: Observations, actions: np.ndarray) -> np.ndarray:
         with th.no_grad():
             tensor = obs_as_tensor(observations, agent.device)
-            estimates = agent.policy.critic(tensor, th.as_tensor(actions, device=agent.device))
+            estimates = policy_network.critic(tensor, th.as_tensor(actions, device=agent.device))
             if quantiles:
                 return estimates.mean(dim=(1, 2)).cpu().numpy()
             return th.cat(estimates, dim=1).amin(dim=1).cpu().numpy()

@@ -110,6 +110,8 @@ def _add_batch_axis(observation: Any, space: gym.Space) -> tuple[Any, bool]:
     if isinstance(space, gym.spaces.Dict):
         key = next(iter(space.spaces))
         is_single = np.ndim(observation[key]) == len(space[key].shape or ())
-        return ({k: np.asarray(v)[None] for k, v in observation.items()} if is_single else observation), is_single
+        return (
+            {k: np.asarray(v)[None] for k, v in observation.items()} if is_single else observation
+        ), is_single
     is_single = np.ndim(observation) == len(space.shape or ())
     return (np.asarray(observation)[None] if is_single else observation), is_single

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_mcbs.algorithms.networks import check_agent, policy_function, value_function
@@ -39,6 +40,7 @@ class Searcher:
         check_agent(agent)
         self.agent = agent
         self.settings = settings
+        self._action_shape = agent.action_space.shape or ()
         self.model: ForwardModel | None = None
         self._policy, self._value = policy_function(agent), value_function(agent)
         self._previous_step_differed = False
@@ -68,12 +70,16 @@ class Searcher:
             roots = self.model.read_roots(self._env_indices)
             observations = self._present_observations(observations)
         n_envs = _n_rows(observations)
-        act_dim = int(np.prod(self.agent.action_space.shape))
+        act_dim = get_action_dim(self.agent.action_space)
         noise = draw_noise(rng, self.settings, n_envs, act_dim)
         return beam_search(self.model, roots, observations, self.agent_functions(), self.settings, noise, rng)
 
     def model_error(
-        self, result: SearchResult, observations: Observations, rewards: np.ndarray, infos: list[dict[str, Any]]
+        self,
+        result: SearchResult,
+        observations: Observations,
+        rewards: np.ndarray,
+        infos: list[dict[str, Any]],
     ) -> float | None:
         """Compare what the search predicted for the executed actions with what happened.
 
@@ -91,13 +97,15 @@ class Searcher:
             return None
         predicted = self.view.observe(result.first_step.observations)
         error = 0.0
-        for env in np.flatnonzero(result.chosen >= 0):
+        for env in np.flatnonzero(result.chosen >= 0).tolist():
             real = infos[env].get("terminal_observation")
             if real is None:
                 real = _row(observations, env)
             error = max(error, _difference(_row(predicted, env), real))
             # A vectorized environment hands rewards on as float32.
-            error = max(error, _difference(np.float32(result.first_step.rewards[env]), np.float32(rewards[env])))
+            error = max(
+                error, _difference(np.float32(result.first_step.rewards[env]), np.float32(rewards[env]))
+            )
         if error > 0:
             self._follow_environment(error)
         self._previous_step_differed = error > 0
@@ -127,7 +135,7 @@ class Searcher:
         :param actions: ``[rows, act_dim]`` in [-1, 1].
         :return: ``[rows, *act_shape]``.
         """
-        return self.agent.policy.unscale_action(actions.reshape(-1, *self.agent.action_space.shape))
+        return self.agent.policy.unscale_action(actions.reshape(-1, *self._action_shape))
 
     def _present_observations(self, observations: Observations) -> Observations:
         """The environments' own observations, checked against those that the agent was given."""
@@ -137,9 +145,9 @@ class Searcher:
         stacked = _stack(present)
         if not _equal(self.view.observe(stacked), observations):
             raise ValueError(
-                "The observations to act on are not those of the environments' present states. A search plans from "
-                "the environments it was given: act in those, step them only through their SnapshotEnvWrapper, and "
-                "keep wrappers that alter observations inside it."
+                "The observations to act on are not those of the environments' present states. A search "
+                "plans from the environments it was given: act in those, step them only through their "
+                "SnapshotEnvWrapper, and keep wrappers that alter observations inside it."
             )
         return stacked
 
@@ -159,7 +167,9 @@ class Searcher:
             except ForwardModelError as reason:
                 message += f"{reason} "
         if self.settings.forward_model != "auto":
-            raise ForwardModelError(message + "forward_model='pool' copies whole environments and can follow.")
+            raise ForwardModelError(
+                message + "forward_model='pool' copies whole environments and can follow."
+            )
         self.model.close()
         self.model = make_forward_model(self.environments, "pool", self.settings.n_threads)
         self._warn(message + f"Now simulating with: {self.model.description}.")
@@ -193,7 +203,7 @@ def _n_rows(observations: Observations) -> int:
 def _equal(left: Observations, right: Observations) -> bool:
     if isinstance(left, dict):
         return isinstance(right, dict) and all(np.array_equal(left[key], right[key]) for key in left)
-    return np.array_equal(left, right)
+    return not isinstance(right, dict) and np.array_equal(left, right)
 
 
 def _difference(left: Any, right: Any) -> float:

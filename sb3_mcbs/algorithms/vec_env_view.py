@@ -49,9 +49,10 @@ class VecEnvView:
             elif type(vec_env) not in _TRANSPARENT:
                 known = ", ".join(cls.__name__ for cls in _PURE + _TRANSPARENT)
                 raise ValueError(
-                    f"Look-ahead cannot see through the vectorized wrapper {type(vec_env).__name__}: it may alter "
-                    f"observations, actions or rewards. Known are {known}. Use a Gymnasium wrapper inside the "
-                    "environment instead (FrameStackObservation for VecFrameStack, for example), or rollout_depth=0."
+                    f"Look-ahead cannot see through the vectorized wrapper {type(vec_env).__name__}: it may "
+                    f"alter observations, actions or rewards. Known are {known}. Use a Gymnasium wrapper "
+                    "inside the environment instead (as FrameStackObservation for VecFrameStack), or "
+                    "rollout_depth=0."
                 )
             vec_env = vec_env.venv
         self.base: VecEnv = vec_env
@@ -85,7 +86,9 @@ class VecEnvView:
         return np.clip(scaled, -normalizer.clip_reward, normalizer.clip_reward)
 
 
-def reward_normalizer(training_env: VecEnv | None, vec_env: VecEnv, normalize_reward: bool | None) -> VecNormalize | None:
+def reward_normalizer(
+    training_env: VecEnv | None, vec_env: VecEnv, normalize_reward: bool | None
+) -> VecNormalize | None:
     """Find the reward scale that the critics learned.
 
     :param training_env: the environment that the agent was trained in, if it is at hand.
@@ -107,8 +110,8 @@ def reward_normalizer(training_env: VecEnv | None, vec_env: VecEnv, normalize_re
             normalize_reward = _has_return_statistics(acts_with)
             if normalize_reward:
                 warnings.warn(
-                    "The environment's VecNormalize has return statistics but does not normalise rewards now. The "
-                    "search assumes that the critics were trained on normalised rewards; pass "
+                    "The environment's VecNormalize has return statistics but does not normalise rewards "
+                    "now. The search assumes that the critics were trained on normalised rewards; pass "
                     "normalize_reward=True or False to say what is true.",
                     stacklevel=3,
                 )
@@ -116,7 +119,9 @@ def reward_normalizer(training_env: VecEnv | None, vec_env: VecEnv, normalize_re
         return None
     normalizer = trained_with or acts_with
     if normalizer is None:
-        raise ValueError("normalize_reward=True needs a VecNormalize around the environment, with its statistics.")
+        raise ValueError(
+            "normalize_reward=True needs a VecNormalize around the environment, with its statistics."
+        )
     return normalizer
 
 
@@ -132,14 +137,16 @@ def snapshot_environments(vec_env: VecEnv) -> Environments:
     :raises TypeError: if the vectorized environment is of another kind.
     """
     if isinstance(vec_env, DummyVecEnv):
-        vec_env.envs = [SnapshotEnvWrapper(env) for env in vec_env.envs]
-        return LocalEnvironments(vec_env.envs)
+        wrapped = [SnapshotEnvWrapper(env) for env in vec_env.envs]
+        vec_env.envs[:] = wrapped
+        return LocalEnvironments(wrapped)
     if isinstance(vec_env, SubprocVecEnv):
         if not all(vec_env.env_is_wrapped(SnapshotEnvWrapper)):
             raise ValueError(
-                "The environments of a SubprocVecEnv live in worker processes and cannot be wrapped afterwards. Wrap "
-                "them when they are made: make_vec_env(..., wrapper_class=SnapshotEnvWrapper), or in an RL Zoo "
-                "hyperparameter file the line\n  env_wrapper: sb3_mcbs.SnapshotEnvWrapper"
+                "The environments of a SubprocVecEnv live in worker processes and cannot be wrapped "
+                "afterwards. Wrap them when they are made: make_vec_env(..., "
+                "wrapper_class=SnapshotEnvWrapper), or in an RL Zoo hyperparameter file the line\n"
+                "  env_wrapper: sb3_mcbs.SnapshotEnvWrapper"
             )
         return WorkerEnvironments(vec_env)
     raise TypeError(f"Look-ahead needs a DummyVecEnv or a SubprocVecEnv, got {type(vec_env).__name__}.")
@@ -152,6 +159,8 @@ def _has_return_statistics(normalizer: VecNormalize) -> bool:
 def _as_space_dtype(observations: Observations, space: spaces.Space) -> Observations:
     if isinstance(space, spaces.Dict):
         assert isinstance(observations, dict)
-        return {key: np.asarray(value).astype(space[key].dtype, copy=False) for key, value in observations.items()}
+        return {
+            key: np.asarray(value).astype(space[key].dtype, copy=False) for key, value in observations.items()
+        }
     assert isinstance(observations, np.ndarray)
     return observations.astype(space.dtype, copy=False)

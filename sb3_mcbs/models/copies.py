@@ -14,7 +14,7 @@ from gymnasium.envs.mujoco import MujocoEnv
 from sb3_mcbs.models.base import Observations
 from sb3_mcbs.models.engines import clear_warnings, has_diverged
 from sb3_mcbs.models.probing import Randomness, isolated_globals, probe_randomness
-from sb3_mcbs.snapshot import Snapshot, SnapshotEnvWrapper
+from sb3_mcbs.snapshot import Snapshot, SnapshotEnvWrapper, SnapshotMismatchError
 
 
 def stack(observations: list[Any]) -> Observations:
@@ -117,6 +117,16 @@ class Copies:
         self, wrapper: SnapshotEnvWrapper, snapshots: list[Snapshot], counts: list[int], seed: int
     ) -> None:
         """Make ``counts[i]`` rows that start at ``snapshots[i]``."""
+        try:
+            self._start_rows(wrapper, snapshots, counts, seed)
+        except SnapshotMismatchError:
+            # The environment has exchanged its simulator since it was copied.
+            self.close()
+            self._start_rows(wrapper, snapshots, counts, seed)
+
+    def _start_rows(
+        self, wrapper: SnapshotEnvWrapper, snapshots: list[Snapshot], counts: list[int], seed: int
+    ) -> None:
         self._rng = np.random.default_rng(seed)
         self._spare += self.rows
         self.rows = []

@@ -80,7 +80,7 @@ class WorkerEnvironments(Environments):
         inner = vec_env.unwrapped
         if not isinstance(inner, SubprocVecEnv):
             raise ForwardModelError(f"expected a SubprocVecEnv, got {type(inner).__name__}")
-        self._check_not_stepping(inner)
+        self._check_available(inner)
         wrapped = inner.env_is_wrapped(SnapshotEnvWrapper)
         if not all(wrapped):
             missing = [i for i, there in enumerate(wrapped) if not there]
@@ -98,7 +98,7 @@ class WorkerEnvironments(Environments):
     def apply_each(
         self, env_indices: Sequence[int], function: Callable[..., Any], args_per_env: Sequence[Sequence[Any]]
     ) -> list[Any]:
-        self._check_not_stepping(self.vec_env)
+        self._check_available(self.vec_env)
         remotes = [self.vec_env.remotes[i] for i in env_indices]
         # Packed here: what a worker cannot unpack would otherwise end the worker without a word.
         calls = [cloudpickle.dumps((function, tuple(args))) for args in args_per_env]
@@ -110,7 +110,9 @@ class WorkerEnvironments(Environments):
         return [self._unpack(i, answer) for i, answer in zip(env_indices, answers, strict=True)]
 
     @staticmethod
-    def _check_not_stepping(vec_env: SubprocVecEnv) -> None:
+    def _check_available(vec_env: SubprocVecEnv) -> None:
+        if vec_env.closed:
+            raise ForwardModelError("the SubprocVecEnv was closed")
         if vec_env.waiting:
             raise ForwardModelError(
                 "the workers are in the middle of a step: call step_wait() before looking ahead"

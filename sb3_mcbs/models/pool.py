@@ -1,5 +1,6 @@
 """The forward model for any environment: real copies, restored from snapshots and stepped."""
 
+import contextlib
 import logging
 import uuid
 from collections.abc import Callable, Sequence
@@ -8,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_mcbs.models.base import ForwardModel, Transition
+from sb3_mcbs.models.base import ForwardModel, ForwardModelError, Transition
 from sb3_mcbs.models.copies import (
     drop_copies,
     open_copies,
@@ -110,7 +111,9 @@ class EnvPoolModel(ForwardModel):
         self.deterministic = not any(randomness.any for randomness in found)
 
     def close(self) -> None:
-        self._environments.apply(range(len(self._environments)), drop_copies, self._name)
+        # Worker processes that have ended took their copies with them.
+        with contextlib.suppress(ForwardModelError):
+            self._environments.apply(range(len(self._environments)), drop_copies, self._name)
         self._counts = {}
 
     def _each(self, function: Callable[..., Any], args: dict[int, tuple[Any, ...]]) -> list[Any]:

@@ -12,6 +12,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 
+from sb3_mcbs.models.base import ForwardModelError
 from sb3_mcbs.models.engines import INTEGRATION
 from sb3_mcbs.models.families import Constants, Fields, family_of, known_families
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
@@ -129,9 +130,13 @@ def read_root(wrapper: SnapshotEnvWrapper, state_size: int, lagging: Sequence[st
     :param state_size: size of its integration state.
     :param lagging: derived fields whose values before the next step count too.
     :return: ``[state_size + sizes of lagging]``.
+    :raises ForwardModelError: if the environment's state has another size by now.
     """
     env: Any = wrapper.unwrapped
     data = env.data
+    if mujoco.mj_stateSize(env.model, INTEGRATION) != state_size:
+        name = type(env).__name__
+        raise ForwardModelError(f"{name} has another MuJoCo model than its forward model: call refresh()")
     state = np.empty(state_size)
     mujoco.mj_getState(env.model, data, state, INTEGRATION)
     if not lagging:
@@ -167,7 +172,9 @@ def sample_transitions(wrapper: SnapshotEnvWrapper, state_size: int, lagging: Se
     records: list[list[Any]] = [[], [], [], [], []]
     try:
         for rollout in range(CHECK_ROLLOUTS):
-            copied.reset(seed=int(rng.integers(2**31)))
+            # The first goes on from where the environment is, if it is anywhere yet.
+            if rollout > 0 or wrapper.last_observation is None:
+                copied.reset(seed=int(rng.integers(2**31)))
             for _ in range(rollout * CHECK_SPACING):
                 copied.step(random_action(copied.action_space, rng))
             for _ in range(CHECK_STEPS):

@@ -88,7 +88,9 @@ def draw_noise(rng: np.random.Generator, settings: SearchSettings, n_envs: int, 
     """
     b, d, n = settings.beam_width, settings.rollout_depth, settings.n_simulations
     beam = _gaussian(rng, (n_envs, b, act_dim), settings.beam_noise, settings.noise_clip)
-    rollout = _gaussian(rng, (d, n_envs, b, n, act_dim), settings.effective_rollout_noise, settings.noise_clip)
+    rollout = _gaussian(
+        rng, (d, n_envs, b, n, act_dim), settings.effective_rollout_noise, settings.noise_clip
+    )
     return Noise(beam, rollout)
 
 
@@ -122,7 +124,9 @@ def beam_search(
         first_step, simulated_steps = None, 0
     else:
         assert model is not None, "a rollout needs a forward model"
-        values, first_step, simulated_steps = _rollout_values(model, roots, candidates, agent, settings, noise, rng)
+        values, first_step, simulated_steps = _rollout_values(
+            model, roots, candidates, agent, settings, noise, rng
+        )
 
     finite = np.isfinite(values)
     invalid_rollouts = int(values.size - np.count_nonzero(finite))
@@ -178,7 +182,9 @@ def _rollout_values(
         step = model.step(agent.unscale_action(actions))
         simulated_steps += len(actions)
         if depth == 0:
-            first_step = FirstStep(_take(step.observations, slice(None, None, n_first)), step.rewards[::n_first].copy())
+            first_step = FirstStep(
+                _take(step.observations, slice(None, None, n_first)), step.rewards[::n_first].copy()
+            )
         rewards = np.where(step.valid, agent.scale_reward(step.rewards).astype(np.float64), np.nan)
         returns[rollout_of_row] += discount * rewards[row_of_rollout]
         discount *= agent.gamma
@@ -218,7 +224,9 @@ def _critic_values(observations: Observations, candidates: np.ndarray, agent: Ag
     return values.reshape(n_envs, beam).astype(np.float64)
 
 
-def _gaussian(rng: np.random.Generator, shape: tuple[int, ...], scale: float, clip: float | None) -> np.ndarray:
+def _gaussian(
+    rng: np.random.Generator, shape: tuple[int, ...], scale: float, clip: float | None
+) -> np.ndarray:
     noise = rng.standard_normal(shape, dtype=np.float32)
     noise *= np.float32(scale)
     if clip is not None:

@@ -63,7 +63,9 @@ class SearchSettings:
         if self.noise_clip is not None:
             _check_noise("noise_clip", self.noise_clip)
         if not isinstance(self.include_policy_action, bool):
-            raise TypeError(f"include_policy_action must be True or False, got {self.include_policy_action!r}.")
+            raise TypeError(
+                f"include_policy_action must be True or False, got {self.include_policy_action!r}."
+            )
         if self.forward_model not in FORWARD_MODELS:
             raise ValueError(f"forward_model must be one of {FORWARD_MODELS}, got {self.forward_model!r}.")
 
@@ -90,12 +92,12 @@ class SearchSettings:
 def _check_integer(name: str, value: Any, low: int, high: int) -> None:
     if isinstance(value, bool) or not isinstance(value, Integral):
         raise TypeError(f"{name} must be an integer, got {value!r}.")
-    if not low <= value <= high:
+    if not low <= int(value) <= high:
         raise ValueError(f"{name} must be between {low} and {high}, got {value}.")
 
 
 def _check_noise(name: str, value: Any) -> None:
     if isinstance(value, bool) or not isinstance(value, Real):
         raise TypeError(f"{name} must be a number, got {value!r}.")
-    if not (math.isfinite(value) and value >= 0):
+    if not (math.isfinite(value) and float(value) >= 0):
         raise ValueError(f"{name} must be finite and not negative, got {value}.")

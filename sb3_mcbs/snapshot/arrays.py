@@ -34,7 +34,7 @@ class ArrayKind:
         if form == "objects":
             _, shape, dtype, items = payload
             array = thawer.memo[index] = np.empty(shape, dtype)
-            array.ravel()[:] = [thawer.thaw(item) for item in items] or None
+            array.ravel()[:] = [thawer.thaw(item) for item in items]
             return array
         content = payload[1]
         if not isinstance(current, np.ndarray) or current.shape != content.shape or not _is_borrowed(current):
@@ -68,9 +68,10 @@ class ArrayKind:
 
 def _is_borrowed(array: np.ndarray) -> bool:
     """Return whether the memory belongs to a simulator, a file or another process."""
-    while isinstance(array.base, np.ndarray):
-        array = array.base
-    return not (array.flags.owndata or array.base is None or isinstance(array.base, bytes | bytearray))
+    root: Any = array
+    while isinstance(root.base, np.ndarray):
+        root = root.base
+    return root.base is not None and not isinstance(root.base, bytes | bytearray)
 
 
 def _layout_in(view: np.ndarray, base: np.ndarray) -> tuple[Any, ...] | None:

@@ -2,6 +2,8 @@
 
 from typing import Any
 
+import gymnasium as gym
+
 from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
 from sb3_mcbs.snapshot.graph import ATOMIC_CLASSES, MISSING, Freezer, Ref, Thawer
 from sb3_mcbs.snapshot.kinds import kind_of
@@ -54,21 +56,22 @@ def thaw_attributes(
     have = vars(env)
     values = dict(attributes)
     for name, value in attributes.items():
-        if name == "_np_random":
-            del values[name]
-            thaw_np_random(thawer, env, value, have)
-        elif type(value) is Ref:
+        if type(value) is Ref and name != "_np_random":
             values[name] = thawer.thaw(value, have.get(name, MISSING))
             if values[name] is MISSING:
                 del values[name]
+    # Gymnasium keeps it on the class until it is first needed.
+    values.pop("_np_random", None)
+    if not isinstance(env, gym.Wrapper):
+        thaw_np_random(thawer, attributes.get("_np_random"), have)
     gone = set()
     if delete_others:
         for name in have:
-            if name not in attributes and name not in not_state and not _is_drawn(have[name]):
+            if name not in attributes and name not in not_state and not _stays(name, have[name]):
                 gone.add(name)
     thawer.do_then(set_attributes, env, values, gone)
 
 
-def _is_drawn(value: Any) -> bool:
+def _stays(name: str, value: Any) -> bool:
     kind = kind_of(value)
-    return kind is not None and kind.name in ("constant", "window")
+    return name == "_np_random" or (kind is not None and kind.name in ("constant", "window"))

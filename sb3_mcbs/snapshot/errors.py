@@ -23,7 +23,7 @@ class SnapshotUnsupportedError(SnapshotError):
             return self.reason
         return (
             f"{''.join(self.path)} cannot be part of a snapshot: {self.reason}. Keep it outside of the "
-            "environment, or say how it is captured with sb3_mcbs.snapshot.register_adapter(predicate, adapter)."
+            "environment, or say how it is captured with sb3_mcbs.snapshot.register_adapter(...)."
         )
 
 

@@ -59,7 +59,7 @@ class FunctionName:
                 found = getattr(found, part, None)
             if not isinstance(found, types.FunctionType):
                 raise SnapshotMismatchError(
-                    f"The snapshot is of an environment that uses the function {self.module}.{self.qualname}; "
+                    f"The snapshot is of an environment that uses {self.module}.{self.qualname}; "
                     "this one uses another at its place, and a function that cannot be imported by its name "
                     "cannot be sent to another process."
                 )

@@ -1,5 +1,6 @@
 """The kinds of objects that environments hold, and how each is frozen, thawed and copied."""
 
+import ctypes
 import enum
 import logging
 import pathlib
@@ -17,7 +18,7 @@ from sb3_mcbs.snapshot.containers import DictKind, SequenceKind
 from sb3_mcbs.snapshot.errors import SnapshotMismatchError
 from sb3_mcbs.snapshot.functions import BuiltinMethodKind, CellKind, FunctionKind, MethodKind
 from sb3_mcbs.snapshot.graph import ATOMIC_CLASSES, MISSING, Copier, Freezer, Kind, Thawer, class_name
-from sb3_mcbs.snapshot.objects import ObjectKind, ReducedKind, is_ordinary
+from sb3_mcbs.snapshot.objects import ObjectKind, ReducedKind, is_global, is_ordinary
 from sb3_mcbs.snapshot.randomness import GeneratorKind, SpaceKind
 from sb3_mcbs.snapshot.registry import SnapshotAdapter, call_on_change, find_adapter
 
@@ -125,8 +126,8 @@ def plan_adapter(thawer: Thawer, adapter: SnapshotAdapter | None, obj: Any, stat
 #: Kinds by name, as nodes name them.
 KINDS: dict[str, Kind] = {}
 for _kind_class in (
-    ConstantKind, WindowKind, ArrayKind, SequenceKind, DictKind, GeneratorKind, SpaceKind, ObjectKind, ReducedKind,
-    AdapterKind, FunctionKind, CellKind, MethodKind, BuiltinMethodKind,
+    ConstantKind, WindowKind, ArrayKind, SequenceKind, DictKind, GeneratorKind, SpaceKind, ObjectKind,
+    ReducedKind, AdapterKind, FunctionKind, CellKind, MethodKind, BuiltinMethodKind,
 ):  # fmt: skip
     KINDS[_kind_class.name] = _kind_class()
 
@@ -164,11 +165,14 @@ def _decide(obj: Any, cls: type) -> Kind | None:
             return KINDS[name]
     if issubclass(cls, _CONSTANT_BASES):
         return KINDS["constant"]
-    name = class_name(cls)
+    # A pointer class is made once, by whoever needs it first; what it points to says whose it is.
+    name = class_name(cls._type_ if issubclass(cls, ctypes._Pointer) else cls)
     if any(name.startswith(part + ".") for part in _DRAWING):
         return KINDS["window"]
     if generators.is_generator(obj):
         return KINDS["generator"]
     if issubclass(cls, spaces.Space):
         return KINDS["space"]
-    return KINDS["object" if is_ordinary(cls) else "reduced"]
+    if is_ordinary(cls):
+        return KINDS["object"]
+    return None if is_global(obj) else KINDS["reduced"]

@@ -6,6 +6,7 @@ model, which environments may edit.
 """
 
 import ctypes
+import functools
 import operator
 import weakref
 from collections import OrderedDict
@@ -22,6 +23,8 @@ from sb3_mcbs.snapshot.registry import SnapshotAdapter
 _LEFT_OUT = ("tex_data",)
 _ALIGNMENT = 64
 _MAX_SPARES = 128
+# Sizes that tell a reader most about how two models differ come first in a message.
+_TELLING = ("nq", "nv", "nu", "nbody", "njnt", "ngeom")
 _MAX_SPARE_MODELS = 16
 
 
@@ -32,39 +35,42 @@ class _ModelLayout:
     """
 
     def __init__(self, model: Any) -> None:
-        arrays = {
-            name: array for name in _public(model) if isinstance(array := getattr(model, name), np.ndarray)
-        }
-        self.sizes = {
-            name: value for name in _public(model) if type(value := getattr(model, name, None)) is int
-        }
+        values = {name: getattr(model, name) for name in _public(type(model))}
+        arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+        self.sizes = {name: value for name, value in values.items() if type(value) is int}
         self.names = bytes(model.names)
         self.blocks = _blocks(
             [array for name, array in arrays.items() if name not in _LEFT_OUT], arrays, model.nbuffer
         )
         # Their values are read for every snapshot; comparing MuJoCo's structures takes 100 times as long.
-        self.structures: list[tuple[Any, list[str], Callable[[Any], Any], list[np.ndarray]]] = []
-        for structure in (model.opt, model.stat):
-            values = {name: getattr(structure, name) for name in _public(structure)}
-            scalars = [name for name, value in values.items() if isinstance(value, int | float)]
-            views = [value for value in values.values() if isinstance(value, np.ndarray)]
-            self.structures.append((structure, scalars, operator.attrgetter(*scalars), views))
+        self.scalars: list[str] = []
+        self.vectors: list[str] = []
+        for part in ("opt", "stat"):
+            for name in _public(type(getattr(model, part))):
+                value = getattr(getattr(model, part), name)
+                if isinstance(value, int | float):
+                    self.scalars.append(f"{part}.{name}")
+                elif isinstance(value, np.ndarray):
+                    self.vectors.append(f"{part}.{name}")
+        self._read_scalars = operator.attrgetter(*self.scalars)
+        self._read_vectors = operator.attrgetter(*self.vectors)
         self.last: ModelState | None = None
 
     def read_blocks(self) -> list[bytes]:
         """Read the values of all arrays."""
         return [block.tobytes() for block in self.blocks]
 
-    def read_structures(self) -> tuple[Any, ...]:
-        """Read the options and statistics."""
-        return tuple(
-            (read(structure), tuple(view.tobytes() for view in views))
-            for structure, _, read, views in self.structures
-        )
+    def read_options(self, model: Any) -> tuple[tuple[Any, ...], list[bytes]]:
+        """Read the options and statistics.
+
+        :param model: the model; a layout that held on to it would keep it alive.
+        """
+        return self._read_scalars(model), [vector.tobytes() for vector in self._read_vectors(model)]
 
 
-def _public(obj: Any) -> list[str]:
-    return [name for name in dir(type(obj)) if not name.startswith("_")]
+@functools.cache
+def _public(cls: type) -> tuple[str, ...]:
+    return tuple(name for name in dir(cls) if not name.startswith("_"))
 
 
 def _address(array: np.ndarray) -> int:
@@ -90,36 +96,39 @@ def _blocks(wanted: list[np.ndarray], arrays: dict[str, np.ndarray], n_buffer: i
 class ModelState:
     """The values of an ``MjModel``: everything but textures and what only concerns drawing.
 
-    :param layout: of the model to read.
+    :param model: the model to read.
+    :param layout: of that model.
     """
 
-    def __init__(self, layout: _ModelLayout) -> None:
+    def __init__(self, model: Any, layout: _ModelLayout) -> None:
         self.sizes = layout.sizes
         self.names = layout.names
         self.blocks = layout.read_blocks()
-        self.structures = layout.read_structures()
+        self.options = layout.read_options(model)
 
-    def is_in(self, layout: _ModelLayout) -> bool:
+    def is_in(self, model: Any, layout: _ModelLayout) -> bool:
         """Return whether a model has exactly these values.
 
-        :param layout: of a model of the same sizes.
+        :param model: the model.
+        :param layout: of that model, which has the same sizes.
         """
-        return self.structures == layout.read_structures() and self.blocks == layout.read_blocks()
+        return self.options == layout.read_options(model) and self.blocks == layout.read_blocks()
 
-    def write(self, layout: _ModelLayout) -> None:
+    def write(self, model: Any, layout: _ModelLayout) -> None:
         """Give a model these values.
 
-        :param layout: of a model of the same sizes.
+        :param model: the model.
+        :param layout: of that model, which has the same sizes.
         """
         for mine, its in zip(self.blocks, layout.blocks, strict=True):
             its[:] = np.frombuffer(mine, np.uint8)
-        for (structure, names, _, views), (scalars, contents) in zip(
-            layout.structures, self.structures, strict=True
-        ):
-            for name, value in zip(names, scalars, strict=True):
-                setattr(structure, name, value)
-            for view, content in zip(views, contents, strict=True):
-                view.reshape(-1)[:] = np.frombuffer(content, view.dtype)
+        scalars, vectors = self.options
+        for path, value in zip(layout.scalars, scalars, strict=True):
+            part, name = path.split(".")
+            setattr(getattr(model, part), name, value)
+        for path, content in zip(layout.vectors, vectors, strict=True):
+            vector = operator.attrgetter(path)(model)
+            vector.reshape(-1)[:] = np.frombuffer(content, vector.dtype)
 
 
 _layouts: dict[int, tuple[Any, _ModelLayout]] = {}
@@ -138,7 +147,8 @@ def _layout(model: Any) -> _ModelLayout:
 
 def _check_same_model(sizes: dict[str, int], names: bytes, layout: _ModelLayout) -> None:
     """Refuse a state of another model, naming what differs."""
-    for name, value in sizes.items():
+    for name in (*_TELLING, *sizes):
+        value = sizes.get(name)
         if layout.sizes.get(name) != value:
             raise SnapshotMismatchError(
                 f"The snapshot is of another MuJoCo model: {name} is {value} in it and "
@@ -173,19 +183,19 @@ class MjModelAdapter(SnapshotAdapter):
 
     def capture(self, obj: Any) -> ModelState:
         layout = _layout(obj)
-        if layout.last is None or not layout.last.is_in(layout):
-            layout.last = ModelState(layout)
+        if layout.last is None or not layout.last.is_in(obj, layout):
+            layout.last = ModelState(obj, layout)
         return layout.last
 
     def restore(self, obj: Any, state: ModelState) -> None:
         layout = _layout(obj)
-        if not state.is_in(layout):
-            state.write(layout)
+        if not state.is_in(obj, layout):
+            state.write(obj, layout)
             layout.last = state
 
     def validate(self, obj: Any, state: ModelState) -> None:
         layout = _layout(obj)
-        if state.sizes is not layout.sizes:
+        if state.sizes != layout.sizes or state.names != layout.names:
             _check_same_model(state.sizes, state.names, layout)
 
     def clone(self, obj: Any, copy: Callable[[Any], Any]) -> Any:
@@ -293,7 +303,7 @@ class MjDataAdapter(SnapshotAdapter):
 
     def validate(self, obj: Any, state: DataState) -> None:
         layout = _layout(obj.model)
-        if state.sizes is not layout.sizes:
+        if state.sizes != layout.sizes or state.names != layout.names:
             _check_same_model(state.sizes, state.names, layout)
 
     def clone(self, obj: Any, copy: Callable[[Any], Any]) -> Any:
@@ -308,7 +318,7 @@ class MjDataAdapter(SnapshotAdapter):
 
 def _counterpart(obj: Any, new: Any, array: np.ndarray) -> np.ndarray | None:
     """Find the view into ``new`` that lies where ``array`` lies in ``obj``."""
-    for name in _public(obj):
+    for name in _public(type(obj)):
         field = getattr(obj, name)
         if not isinstance(field, np.ndarray) or not np.may_share_memory(field, array):
             continue

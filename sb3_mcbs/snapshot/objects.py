@@ -117,9 +117,7 @@ def _reduce(obj: Any) -> tuple[Any, tuple[Any, ...], Any, list[Any], list[Any]]:
     except Exception as error:
         raise SnapshotUnsupportedError(f"its class is {class_name(type(obj))} and {error}") from error
     if isinstance(reduced, str):
-        raise SnapshotUnsupportedError(
-            f"its class is {class_name(type(obj))}, which is only known by name ({reduced})"
-        )
+        raise SnapshotUnsupportedError(f"its class is {class_name(type(obj))} and it is a global, {reduced}")
     function, arguments, state, items, pairs = (*reduced, None, None, None)[:5]
     return function, arguments, state, list(items or ()), list(pairs or ())
 
@@ -140,6 +138,17 @@ def _fill(made: Any, state: Any, items: list[Any], pairs: list[Any]) -> Any:
     for key, value in pairs:
         made[key] = value
     return made
+
+
+def is_global(obj: Any) -> bool:
+    """Return whether an object of a compiled class is a global of some module, such as a compiled function.
+
+    :param obj: the object.
+    """
+    try:
+        return isinstance(obj.__reduce_ex__(4), str)
+    except Exception:
+        return False
 
 
 def is_ordinary(cls: type) -> bool:

@@ -55,8 +55,7 @@ class SpaceKind:
                 f"A space of the snapshot has {len(payload)} parts, here it has {len(parts)} ({current})."
             )
         for part, value in zip(parts, payload, strict=True):
-            if value is not None or part._np_random is not None or thawer.rng != "restore":
-                thaw_np_random(thawer, part, value, vars(part))
+            thaw_np_random(thawer, value, vars(part))
         return current
 
     def copy(self, copier: Copier, obj: spaces.Space) -> Any:
@@ -84,13 +83,12 @@ def _parts(space: spaces.Space) -> list[spaces.Space]:
     return parts
 
 
-def thaw_np_random(thawer: Thawer, owner: Any, value: Any, attributes: dict[str, Any]) -> None:
+def thaw_np_random(thawer: Thawer, value: Any, attributes: dict[str, Any]) -> None:
     """Plan what becomes of the ``_np_random`` of an environment or a space.
 
     :param thawer: carries the choice between restoring, keeping and seeding afresh.
-    :param owner: the environment or space.
     :param value: the frozen value: None if no generator was there.
-    :param attributes: the attributes of ``owner``.
+    :param attributes: the attributes of the environment or space.
     """
     current = attributes.get("_np_random")
     if value is not None:

@@ -14,9 +14,11 @@ class SnapshotAdapter(ABC):
     :cvar with_attributes: for an adapter of whole environments or wrappers: whether their Python
         attributes are captured besides what :meth:`capture` returns. They are put back after
         :meth:`restore` has run; attributes that cannot be captured are then the adapter's business.
+    :cvar not_state: names of attributes that are neither captured nor put back.
     """
 
     with_attributes: bool = False
+    not_state: frozenset[str] = frozenset()
 
     def attach(self, env: Any) -> None:  # noqa: B027
         """Prepare an environment; called when it is wrapped in ``SnapshotEnvWrapper``.

@@ -1,5 +1,6 @@
 """Snapshots by replay, for simulators that cannot be copied (Box2D)."""
 
+import functools
 import inspect
 import time
 import warnings
@@ -12,6 +13,9 @@ from sb3_mcbs.snapshot.graph import Freezer, Node, Ref, Thawer, private_copy
 from sb3_mcbs.snapshot.kinds import KINDS, kind_of
 from sb3_mcbs.snapshot.layers import NOT_STATE
 from sb3_mcbs.snapshot.registry import SnapshotAdapter
+
+_RECORDER = "_snapshot_recorder"
+_NOT_STATE = NOT_STATE | {"reset", "step", _RECORDER}
 
 
 class Episode(NamedTuple):
@@ -36,16 +40,21 @@ class Recorder:
     come through a ``SnapshotEnvWrapper``.
 
     :param env: the environment.
+    :param prepare: called with the environment before each reset.
     """
 
-    def __init__(self, env: Any) -> None:
+    def __init__(self, env: Any, prepare: Callable[[Any], None] | None) -> None:
         self.env = env
+        self._prepare = prepare
         self.episode: Episode | None = None
         self.actions: list[Any] = []
         self._reset = env.reset
         self._step = env.step
-        env.reset = self.reset
-        env.step = self.step
+        # Many environments step once in their reset, and that step must not be recorded as well.
+        self._inside = False
+        env.reset = functools.wraps(env.reset)(lambda **arguments: self.reset(**arguments))
+        env.step = functools.wraps(env.step)(lambda action: self.step(action))
+        setattr(env, _RECORDER, self)
 
     def reset(self, **arguments: Any) -> Any:
         """Reset the environment and begin a record.
@@ -53,7 +62,9 @@ class Recorder:
         :param arguments: of the environment's ``reset``.
         :return: what the environment returns.
         """
-        self.begin(arguments)
+        if not self._inside:
+            self.begin(arguments)
+            return self._begin_episode(arguments)
         return self._reset(**arguments)
 
     def step(self, action: Any) -> Any:
@@ -62,8 +73,21 @@ class Recorder:
         :param action: of the environment's ``step``.
         :return: what the environment returns.
         """
-        self.actions.append(private_copy(action))
-        return self._step(action)
+        if not self._inside:
+            self.actions.append(private_copy(action))
+        return self._call(self._step, action)
+
+    def _begin_episode(self, arguments: dict[str, Any]) -> Any:
+        if self._prepare is not None:
+            self._prepare(self.env)
+        return self._call(self._reset, **arguments)
+
+    def _call(self, function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+        inside, self._inside = self._inside, True
+        try:
+            return function(*arguments, **named)
+        finally:
+            self._inside = inside
 
     def begin(self, arguments: dict[str, Any]) -> None:
         """Begin a record.
@@ -85,16 +109,13 @@ class Recorder:
         thawer.commit()
         render_mode, self.env.render_mode = self.env.render_mode, None
         try:
-            self._reset(**private_copy(episode.reset))
+            self._begin_episode(private_copy(episode.reset))
             for action in episode.actions:
-                self._step(private_copy(action))
+                self._call(self._step, private_copy(action))
         finally:
             self.env.render_mode = render_mode
         self.episode = episode._replace(actions=())
         self.actions = list(episode.actions)
-
-
-_NOT_STATE = NOT_STATE | {"reset", "step"}
 
 
 class ReplayAdapter(SnapshotAdapter):
@@ -106,17 +127,22 @@ class ReplayAdapter(SnapshotAdapter):
 
     The environment's Python attributes are put back afterwards, where they can be captured. What is
     done to the simulator other than through the environment's ``reset`` and ``step`` is not repeated.
+
+    :param prepare: called with the environment before each reset, the live ones included. It has to make
+        the episode independent of those before it where the environment does not do so itself.
     """
 
     with_attributes = True
+    not_state = frozenset({"reset", "step", _RECORDER})
 
-    def __init__(self) -> None:
+    def __init__(self, prepare: Callable[[Any], None] | None = None) -> None:
+        self._prepare = prepare
         self._told: set[type] = set()
 
     def attach(self, env: Any) -> None:
         if _recorder(env) is None:
             _constructor_arguments(env)
-            Recorder(env)
+            Recorder(env, self._prepare)
 
     def capture(self, obj: Any) -> Episode | None:
         recorder = _recorder(obj)
@@ -146,16 +172,15 @@ class ReplayAdapter(SnapshotAdapter):
             return
         self._told.add(type(env))
         warnings.warn(
-            f"The simulator of {type(env).__name__} cannot be copied, so its snapshots are restored by repeating "
-            f"the episode: this restore took {1e3 * seconds:.2f} ms for {n_steps} steps, and later in an episode "
-            "it takes longer.",
+            f"The simulator of {type(env).__name__} cannot be copied, so its snapshots are restored by "
+            f"repeating the episode: this restore took {1e3 * seconds:.2f} ms for {n_steps} steps, and later "
+            "in an episode it takes longer.",
             stacklevel=2,
         )
 
 
 def _recorder(env: Any) -> Recorder | None:
-    owner = getattr(vars(env).get("step"), "__self__", None)
-    return owner if isinstance(owner, Recorder) else None
+    return vars(env).get(_RECORDER)
 
 
 def _constructor_arguments(env: Any) -> dict[str, Any]:
@@ -184,7 +209,7 @@ def _constructor_arguments(env: Any) -> dict[str, Any]:
         if missing:
             raise SnapshotUnsupportedError(
                 f"{type(env).__name__} is restored by replay, and for clones its constructor's arguments "
-                f"{missing} must be known. Derive it from gymnasium.utils.EzPickle, or make it with gymnasium.make."
+                f"{missing} must be known. Derive it from gymnasium.utils.EzPickle or use gymnasium.make."
             )
     if "render_mode" in arguments:
         arguments["render_mode"] = None
@@ -200,3 +225,21 @@ def uses_box2d(env: Any) -> bool:
     return hasattr(env, "step") and any(
         type(value).__module__.partition(".")[0] == "Box2D" for value in values
     )
+
+
+def renew_world(env: Any) -> None:
+    """Give a Box2D environment of Gymnasium a new world.
+
+    A world in which an episode has been simulated is not as it was, even when all bodies are gone: what
+    follows depends on it in the last bits. LunarLander makes a new one at each reset, the others do not.
+
+    :param env: the environment.
+    """
+    if not any(cls.__module__.startswith("gymnasium.envs.box2d.") for cls in type(env).__mro__):
+        return
+    env._destroy()
+    listener = getattr(env, "contactListener_keepref", None)
+    gravity = env.world.gravity
+    env.world = type(env.world)(gravity=gravity)
+    if listener is not None:
+        env.world.contactListener = listener

@@ -41,7 +41,7 @@ class Stack:
     """
 
     def __init__(self, owner: gym.Wrapper[Any, Any, Any, Any]) -> None:
-        self._layers = layers_of(owner.env)
+        self._layers = [_with_adapter(layer) for layer in layers_of(owner.env)]
         self._stateful = [layer for layer in self._layers if not layer.recorder]
         self._names = [layer.name for layer in self._stateful]
         self._adapters: dict[int, SnapshotAdapter] = {}
@@ -176,6 +176,11 @@ class Stack:
             if copies[id(layer.env)] is not copies[id(layer.env.env)]:
                 copies[id(layer.env)].env = copies[id(layer.env.env)]
         return below
+
+
+def _with_adapter(layer: Layer) -> Layer:
+    adapter = find_adapter(layer.env)
+    return layer if adapter is None else layer._replace(not_state=layer.not_state | adapter.not_state)
 
 
 def _short(names: list[str]) -> str:
