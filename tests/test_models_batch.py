@@ -28,6 +28,12 @@ from sb3_mcbs.snapshot import SnapshotEnvWrapper
 RNG = np.random.default_rng(0)
 
 
+@pytest.fixture(autouse=True)
+def in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """MuJoCo writes a log file where it runs when a simulation diverges."""
+    monkeypatch.chdir(tmp_path)
+
+
 def cheetah(**kwargs) -> SnapshotEnvWrapper:
     env = SnapshotEnvWrapper(gym.make("HalfCheetah-v5", **kwargs))
     env.reset(seed=0)
@@ -324,8 +330,11 @@ def test_an_edited_model_is_simulated_as_it_was_when_the_model_was_made() -> Non
 def test_nothing_outside_is_touched(kind: str, tmp_path: Path) -> None:
     """Making a model and looking ahead change no state that anybody else can see."""
 
+    folder = tmp_path / "monitor"
+    folder.mkdir()
+
     def make(name: str) -> Monitor:
-        return Monitor(gym.make("HalfCheetah-v5", max_episode_steps=12), str(tmp_path / name))
+        return Monitor(gym.make("HalfCheetah-v5", max_episode_steps=12), str(folder / name))
 
     vec_envs = [
         DummyVecEnv([lambda name=name: SnapshotEnvWrapper(make(name))]) for name in ("watched", "twin")
@@ -344,7 +353,7 @@ def test_nothing_outside_is_touched(kind: str, tmp_path: Path) -> None:
         ]
         space = vec_envs[0].envs[0].action_space
         states.append(space.np_random.bit_generator.state)
-        files = [path.read_bytes() for path in sorted(tmp_path.iterdir())]
+        files = [path.read_bytes() for path in sorted(folder.iterdir())]
         return [pickle.dumps(state) for state in states] + files
 
     before = outside()
@@ -364,7 +373,7 @@ def test_nothing_outside_is_touched(kind: str, tmp_path: Path) -> None:
     model.close()
     assert outside()[0:3] == before[0:3]
     rows = []
-    for path in sorted(tmp_path.iterdir()):
+    for path in sorted(folder.iterdir()):
         with path.open() as file:
             file.readline()
             rows.append([(row["r"], row["l"]) for row in csv.DictReader(file)])

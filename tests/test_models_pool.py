@@ -2,6 +2,7 @@
 
 import logging
 import random
+from pathlib import Path
 
 import gymnasium as gym
 import mujoco
@@ -20,6 +21,12 @@ from sb3_mcbs.models import EnvPoolModel, ForwardModelError, LocalEnvironments, 
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 
 RNG = np.random.default_rng(0)
+
+
+@pytest.fixture(autouse=True)
+def in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """MuJoCo writes a log file where it runs when a simulation diverges."""
+    monkeypatch.chdir(tmp_path)
 
 
 class PointEnv(gym.Env):

@@ -20,6 +20,7 @@ from stable_baselines3.common.vec_env import (
 )
 
 from sb3_mcbs import MCBSTD3, SnapshotEnvWrapper
+from sb3_mcbs.models import ForwardModelError
 from tests.conftest import assert_same_parameters, parameters_of, snapshot_vec_env
 
 
@@ -157,6 +158,22 @@ def test_an_edited_environment_is_followed(make_agent, tmp_path):
     agent.logger.dump(2)
     errors = [entry["search/model_error"] for entry in read()]
     assert errors[0] > 0 and errors[-1] == 0
+
+
+def test_a_model_that_cannot_read_the_environment_any_more_is_rebuilt(make_agent, monkeypatch):
+    agent = make_agent("Hopper-v5").learn(30)
+    model = agent._searcher.model
+    read_roots, failures = model.read_roots, [ForwardModelError("the environment has another simulator now.")]
+
+    def fail_once(env_indices):
+        if failures:
+            raise failures.pop()
+        return read_roots(env_indices)
+
+    monkeypatch.setattr(model, "read_roots", fail_once)
+    with pytest.warns(UserWarning, match=r"another simulator now\..*rebuilt"):
+        agent.learn(10, reset_num_timesteps=False)
+    assert agent.n_decisions == 20 and agent._searcher.model is model
 
 
 class RandomPush(gym.Wrapper):

@@ -67,7 +67,7 @@ class Searcher:
             self.agent.policy.set_training_mode(False)
         roots: list[Any] = []
         if self.model is not None:
-            roots = self.model.read_roots(self._env_indices)
+            roots = self._read_roots()
             observations = self._present_observations(observations)
         n_envs = _n_rows(observations)
         act_dim = get_action_dim(self.agent.action_space)
@@ -107,7 +107,7 @@ class Searcher:
                 error, _difference(np.float32(result.first_step.rewards[env]), np.float32(rewards[env]))
             )
         if error > 0:
-            self._follow_environment(error)
+            self._follow_environment(f"The forward model's prediction differs from reality by {error:.3g}. ")
         self._previous_step_differed = error > 0
         return error
 
@@ -151,11 +151,22 @@ class Searcher:
             )
         return stacked
 
-    def _follow_environment(self, error: float) -> None:
+    def _read_roots(self) -> list[Any]:
         assert self.model is not None
-        message = f"The forward model's prediction differs from the environment by {error:.3g}. "
-        is_pool = self.model.kind == "pool"
-        if is_pool:
+        try:
+            return self.model.read_roots(self._env_indices)
+        except ForwardModelError as reason:  # the environment exchanged its simulator
+            self._follow_environment(f"{reason} ")
+            return self.model.read_roots(self._env_indices)
+
+    def _follow_environment(self, message: str) -> None:
+        """Make the forward model what the environments are now.
+
+        :param message: what was noticed, for the warning.
+        :raises ForwardModelError: if the forward model that was asked for cannot follow.
+        """
+        assert self.model is not None
+        if self.model.kind == "pool":
             self.model.deterministic = False
             self._warn(message + "Its dynamics are random; every simulation now draws its own randomness.")
             return

@@ -71,6 +71,20 @@ class MujocoBatchModel(ForwardModel):
 
     def refresh(self) -> None:
         known = self._recognize_all()
+        try:
+            self._prepare(known)
+            self._check()
+        except ForwardModelError:
+            raise
+        except Exception as error:
+            # An array function that does not fit: whoever asked for "auto" still has the pool.
+            name = known.env_class.__name__
+            raise NotRecognizedError(
+                f"the family of {name} failed with {type(error).__name__}: {error}"
+            ) from error
+
+    def _prepare(self, known: KnownEnvironment) -> None:
+        """Take over what the environments are now, without rows."""
         family = family_of(known.env_class)
         assert family is not None
         self._family = family
@@ -81,15 +95,8 @@ class MujocoBatchModel(ForwardModel):
         self._build(_FIRST_CAPACITY)
         self._rows = 0
         n_threads = f"{self._n_threads} thread{'s' if self._n_threads > 1 else ''}"
-        kind = type(self._engine).__name__
-        self.description = f"MuJoCo batch of {known.env_class.__name__} ({kind}, {n_threads})"
-        try:
-            self._check()
-        except ForwardModelError:
-            raise
-        except Exception as error:
-            # An array function that does not fit: whoever asked for "auto" still has the pool.
-            raise NotRecognizedError(f"the check failed with {type(error).__name__}: {error}") from error
+        engine = type(self._engine).__name__
+        self.description = f"MuJoCo batch of {known.env_class.__name__} ({engine}, {n_threads})"
 
     def _recognize_all(self) -> KnownEnvironment:
         found = self._environments.apply(range(len(self._environments)), recognize)

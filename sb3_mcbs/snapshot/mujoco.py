@@ -6,7 +6,6 @@ model, which environments may edit.
 """
 
 import ctypes
-import functools
 import operator
 import weakref
 from collections import OrderedDict
@@ -68,7 +67,6 @@ class _ModelLayout:
         return self._read_scalars(model), [vector.tobytes() for vector in self._read_vectors(model)]
 
 
-@functools.cache
 def _public(cls: type) -> tuple[str, ...]:
     return tuple(name for name in dir(cls) if not name.startswith("_"))
 
