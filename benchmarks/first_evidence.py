@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from stable_baselines3.common.monitor import load_results
+from stable_baselines3.common.save_util import load_from_zip_file
 
 from sb3_mcbs.zoo.repeat import load_run
 from sb3_mcbs.zoo.report import ACTOR, SEARCH, load_policies
@@ -162,6 +163,29 @@ def _arm(algo: str, policy: str, by_seed: dict[int, float]) -> dict[str, Any]:
     }
 
 
+def training_costs(args: argparse.Namespace, runs: list[Run]) -> list[dict[str, Any]]:
+    """
+    :param args: the command line
+    :param runs: finished runs
+    :return: what the training of each run cost; the wall-clock time includes its evaluations
+    """
+    costs = []
+    for run in runs:
+        episodes = load_results(str(run.folder))
+        final, _, _ = load_from_zip_file(run.folder / f"{args.env}.zip", device="cpu")
+        assert final is not None
+        costs.append(
+            {
+                "algo": run.algo,
+                "seed": run.seed,
+                "environment_steps": int(final["num_timesteps"]),
+                "simulated_steps": int(final.get("n_simulated_steps", 0)),
+                "wall_clock_minutes": float(episodes["t"].iloc[-1]) / 60,
+            }
+        )
+    return costs
+
+
 def configuration_difference(runs: list[Run]) -> list[str]:
     """
     :param runs: finished runs
@@ -235,7 +259,8 @@ def summarise(args: argparse.Namespace) -> None:
         writer.writeheader()
         writer.writerows(rows)
     commands = [subprocess.list2cmdline(["python", *command(args, run.algo, run.seed)[1:]]) for run in runs]
-    summary = {"commands": commands, "difference": difference, "arms": arms}
+    costs = training_costs(args, runs)
+    summary = {"commands": commands, "difference": difference, "arms": arms, "costs": costs}
     (folder / "summary.json").write_text(json.dumps(summary, indent=2))
     draw(rows, f"{args.env}: mean over seeds, thin lines are single seeds", folder / "learning_curves.png")
 
@@ -246,6 +271,13 @@ def summarise(args: argparse.Namespace) -> None:
         seeds = ", ".join(f"{seed}: {value:.0f}" for seed, value in arm["seeds"].items())
         span = f"{arm['min']:.0f} to {arm['max']:.0f}"
         print(f"| {LABELS[arm['algo']]} | {arm['policy']} | {arm['mean']:.0f} | {span} | {seeds} |")
+    print("\n| agent | seed | environment steps | simulated steps | minutes, evaluations included |")
+    print("|---|---|---|---|---|")
+    for cost in costs:
+        print(
+            f"| {LABELS[cost['algo']]} | {cost['seed']} | {cost['environment_steps']} "
+            f"| {cost['simulated_steps']} | {cost['wall_clock_minutes']:.1f} |"
+        )
     print(f"\nWritten: {folder}/evaluations.csv, summary.json, learning_curves.png")
 
 

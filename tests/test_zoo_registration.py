@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-import time
 import types
 import warnings
 from pathlib import Path
@@ -95,20 +94,6 @@ def test_hook_imports_nothing_that_an_interpreter_has_not_loaded() -> None:
         "before = set(sys.modules); import _sb3_mcbs_hook"
     )
     assert python(f"{code}; print(set(sys.modules) - before)", "-I") == "{'_sb3_mcbs_hook'}"
-
-
-def test_hook_takes_less_than_a_millisecond() -> None:
-    code = compile(Path(hook.__file__).read_text(), hook.__file__, "exec")
-    finders = list(sys.meta_path)
-    seconds = []
-    try:
-        for _ in range(20):
-            start = time.perf_counter()
-            exec(code, {"__name__": "_sb3_mcbs_hook"})
-            seconds.append(time.perf_counter() - start)
-    finally:
-        sys.meta_path[:] = finders
-    assert min(seconds) < 1e-3
 
 
 def test_hook_is_put_in_place_once(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -128,6 +128,14 @@ def test_explicit_configuration_wins(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert config == own["Pendulum-v1"]
 
 
+def test_mujoco_lands_on_the_batch(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ("-n", "120", "--eval-freq", "-1", "-params", *TINY_SEARCH)
+    zoo_train(monkeypatch, tmp_path, "mcbs_td3", *words, env="HalfCheetah-v5")
+    assert "Forward model: MuJoCo batch of HalfCheetahEnv" in capsys.readouterr().out
+
+
 def test_several_environments_in_this_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     zoo_train(monkeypatch, tmp_path, "mcbs_td3", "-n", "240", "--eval-freq", "200", "--eval-episodes", "1",
               "-params", *TINY_SEARCH, "n_envs:4")  # fmt: skip
