@@ -114,6 +114,16 @@ def test_agents_without_critics_are_refused():
         SearchPolicy(PPO("MlpPolicy", env, n_steps=8, batch_size=8, device="cpu"), env)
 
 
+def test_can_be_made_in_the_middle_of_an_episode(make_agent):
+    for env_id in ("HalfCheetah-v5", "Pendulum-v1"):
+        env = make_vec_env(env_id, 2, seed=0)
+        env.reset()
+        observation, *_ = env.step(np.zeros((2, *env.action_space.shape), dtype=np.float32))
+        policy = SearchPolicy(make_agent(env_id), env, seed=0)
+        policy.predict(observation)
+        assert (policy.last_result.chosen >= 0).all()
+
+
 def test_observations_of_another_moment_are_refused(make_agent):
     env = make_vec_env("Pendulum-v1", 1)
     policy = SearchPolicy(make_agent(), env)
