@@ -6,10 +6,14 @@ from copy import deepcopy
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_mcbs import MCBSTD3, SnapshotEnvWrapper
+
+# Small networks are fastest on one thread, and idle OpenMP threads would take cores from the simulations.
+th.set_num_threads(1)
 
 SMALL = dict(policy_kwargs=dict(net_arch=[16, 16]), buffer_size=2000, batch_size=16, device="cpu")
 SMALL_SEARCH = dict(beam_width=3, rollout_depth=2, n_simulations=2, n_threads=1)

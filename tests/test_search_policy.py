@@ -46,12 +46,12 @@ def test_critics_and_actor_are_the_agents(make_agent, cls):
 
 def test_search_beats_a_bad_actor():
     """With a known reward even an untrained agent acts better by looking ahead."""
-    env = make_vec_env("HalfCheetah-v5", 1, seed=0)
+    env = make_vec_env("HalfCheetah-v5", 1, seed=0, env_kwargs=dict(max_episode_steps=200))
     agent = TD3("MlpPolicy", env, seed=0, policy_kwargs=dict(net_arch=[16]), device="cpu", buffer_size=10)
     plain, _ = evaluate_policy(agent, env, n_eval_episodes=1)
     settings = dict(beam_width=24, rollout_depth=4, n_simulations=1, beam_noise=0.6)
     searched, _ = evaluate_policy(SearchPolicy(agent, env, seed=0, **settings), env, n_eval_episodes=1)
-    assert searched > plain + 100
+    assert searched > plain + 20
 
 
 def test_seed_decides_the_actions(make_agent):
