@@ -37,6 +37,8 @@ def test_trains(make_agent, env_id, depth):
     before = parameters_of(agent)["actor.mu.0.weight"]
     agent.learn(60)
     assert agent.num_timesteps == 60 and agent.n_decisions == 40
+    if depth:
+        assert agent._searcher.model.kind == ("mujoco" if env_id == "HalfCheetah-v5" else "pool")
     first_steps, later_steps = 3, (depth - 1) * 6
     assert agent.n_simulated_steps == (40 * (first_steps + later_steps) if depth else 0)
     assert not np.array_equal(before, parameters_of(agent)["actor.mu.0.weight"])

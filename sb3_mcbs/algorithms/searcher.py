@@ -140,6 +140,9 @@ class Searcher:
     def _present_observations(self, observations: Observations) -> Observations:
         """The environments' own observations, checked against those that the agent was given."""
         present = self.environments.apply(self._env_indices, _last_observation)
+        for index, observation in enumerate(present):
+            if observation is None:
+                present[index] = self.view.buffered_observation(index)
         if any(observation is None for observation in present):
             raise ValueError("Reset the vectorized environment before the first search.")
         stacked = _stack(present)

@@ -58,6 +58,17 @@ class VecEnvView:
             vec_env = vec_env.venv
         self.base: VecEnv = vec_env
 
+    def buffered_observation(self, index: int) -> Any:
+        """What an environment of this process returned last, also if it was wrapped after that.
+
+        :param index: which environment.
+        :return: its observation, or ``None`` for environments of other processes.
+        """
+        if not isinstance(self.base, DummyVecEnv):
+            return None
+        rows: dict[Any, np.ndarray] = {key: values[index].copy() for key, values in self.base.buf_obs.items()}
+        return rows.get(None, rows)
+
     def observe(self, observations: Observations) -> Observations:
         """Pass observations of the environments through the wrappers.
 
@@ -140,10 +151,6 @@ def snapshot_environments(vec_env: VecEnv) -> Environments:
     if isinstance(vec_env, DummyVecEnv):
         wrapped = [SnapshotEnvWrapper(env) for env in vec_env.envs]
         vec_env.envs[:] = wrapped
-        for index, env in enumerate(wrapped):
-            if env.last_observation is None:
-                # Whoever was reset before it was wrapped shows its observation here.
-                env.last_observation = _buffered_observation(vec_env, index)
         return LocalEnvironments(wrapped)
     if isinstance(vec_env, SubprocVecEnv):
         if not all(vec_env.env_is_wrapped(SnapshotEnvWrapper)):
@@ -155,11 +162,6 @@ def snapshot_environments(vec_env: VecEnv) -> Environments:
             )
         return WorkerEnvironments(vec_env)
     raise TypeError(f"Look-ahead needs a DummyVecEnv or a SubprocVecEnv, got {type(vec_env).__name__}.")
-
-
-def _buffered_observation(vec_env: DummyVecEnv, index: int) -> Any:
-    rows: dict[Any, np.ndarray] = {key: values[index].copy() for key, values in vec_env.buf_obs.items()}
-    return rows.get(None, rows)
 
 
 def _has_return_statistics(normalizer: VecNormalize) -> bool:
