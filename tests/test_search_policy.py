@@ -108,6 +108,30 @@ def test_gym_environment(make_agent):
     env.step(action)
 
 
+def test_torch_threads_are_put_back(make_agent, monkeypatch):
+    import torch as th
+
+    env = make_vec_env("Pendulum-v1", 1)
+    policy = SearchPolicy(make_agent(), env, seed=0)
+    observation = env.reset()
+    seen = []
+    actor = policy.model.actor.forward
+    monkeypatch.setattr(
+        policy.model.actor, "forward", lambda obs: seen.append(th.get_num_threads()) or actor(obs)
+    )
+    th.set_num_threads(2)
+    try:
+        policy.predict(observation)
+        assert th.get_num_threads() == 2
+        monkeypatch.setattr(policy.model.actor, "forward", lambda obs: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            policy.predict(observation)
+        assert th.get_num_threads() == 2
+    finally:
+        th.set_num_threads(1)
+    assert set(seen) == {1}
+
+
 def test_agents_without_critics_are_refused():
     env = make_vec_env("Pendulum-v1", 1)
     with pytest.raises(TypeError, match="PPO"):

@@ -2,9 +2,12 @@
 
 import logging
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
+import torch as th
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.vec_env import VecEnv
@@ -72,7 +75,10 @@ class Searcher:
         n_envs = _n_rows(observations)
         act_dim = get_action_dim(self.agent.action_space)
         noise = draw_noise(rng, self.settings, n_envs, act_dim)
-        return beam_search(self.model, roots, observations, self.agent_functions(), self.settings, noise, rng)
+        with _one_torch_thread():
+            return beam_search(
+                self.model, roots, observations, self.agent_functions(), self.settings, noise, rng
+            )
 
     def model_error(
         self,
@@ -192,6 +198,20 @@ class Searcher:
     def _warn(message: str) -> None:
         logger.warning(message)
         warnings.warn(message, stacklevel=4)
+
+
+@contextmanager
+def _one_torch_thread() -> Iterator[None]:
+    """Torch's idle threads spin between calls, on the cores that the simulation needs."""
+    n_threads = th.get_num_threads()
+    if n_threads == 1:
+        yield
+        return
+    th.set_num_threads(1)
+    try:
+        yield
+    finally:
+        th.set_num_threads(n_threads)
 
 
 def _last_observation(env: SnapshotEnvWrapper) -> Any:
