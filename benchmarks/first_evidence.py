@@ -61,6 +61,18 @@ def command(args: argparse.Namespace, algo: str, seed: int) -> list[str]:
     ]
 
 
+def command_of(args: argparse.Namespace, run: Run) -> str:
+    """
+    :param args: the command line
+    :param run: a run on the disk
+    :return: the command that makes it again, with the evaluations that it had
+    """
+    _, saved = load_run(run.folder)
+    own = {name: saved[name] for name in ("eval_freq", "eval_episodes")}
+    words = command(argparse.Namespace(**{**vars(args), **own}), run.algo, run.seed)
+    return subprocess.list2cmdline(["python", *words[1:]])
+
+
 def find_runs(args: argparse.Namespace) -> list[Run]:
     """
     :param args: the command line
@@ -258,7 +270,7 @@ def summarise(args: argparse.Namespace) -> None:
         writer = csv.DictWriter(file, fieldnames=list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
-    commands = [subprocess.list2cmdline(["python", *command(args, run.algo, run.seed)[1:]]) for run in runs]
+    commands = [command_of(args, run) for run in runs]
     costs = training_costs(args, runs)
     summary = {"commands": commands, "difference": difference, "arms": arms, "costs": costs}
     (folder / "summary.json").write_text(json.dumps(summary, indent=2))
