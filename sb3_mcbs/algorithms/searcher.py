@@ -16,6 +16,7 @@ from sb3_mcbs.algorithms.networks import check_agent, policy_function, value_fun
 from sb3_mcbs.algorithms.vec_env_view import VecEnvView, reward_normalizer, snapshot_environments
 from sb3_mcbs.models import Environments, ForwardModel, ForwardModelError, make_forward_model
 from sb3_mcbs.models.base import Observations
+from sb3_mcbs.models.copies import stack
 from sb3_mcbs.search import Agent, SearchResult, SearchSettings, beam_search, draw_noise
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 
@@ -151,7 +152,7 @@ class Searcher:
                 present[index] = self.view.buffered_observation(index)
         if any(observation is None for observation in present):
             raise ValueError("Reset the vectorized environment before the first search.")
-        stacked = _stack(present)
+        stacked = stack(present)
         if not _equal(self.view.observe(stacked), observations):
             raise ValueError(
                 "The observations to act on are not those of the environments' present states. A search "
@@ -216,12 +217,6 @@ def _one_torch_thread() -> Iterator[None]:
 
 def _last_observation(env: SnapshotEnvWrapper) -> Any:
     return env.last_observation
-
-
-def _stack(observations: list[Any]) -> Observations:
-    if isinstance(observations[0], dict):
-        return {key: np.stack([observation[key] for observation in observations]) for key in observations[0]}
-    return np.stack(observations)
 
 
 def _row(observations: Observations, index: int) -> Any:
