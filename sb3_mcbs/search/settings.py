@@ -5,8 +5,7 @@ from dataclasses import dataclass, fields
 from numbers import Integral, Real
 from typing import Any
 
-#: Forward models that can be asked for by name; ``"auto"`` takes the fastest that is exact.
-FORWARD_MODELS = ("auto", "mujoco", "pool")
+from sb3_mcbs.models.factory import KINDS
 
 #: More rollouts than this per environment are a mistake, not a search: memory would run out.
 MAX_ROLLOUTS = 100_000
@@ -66,8 +65,8 @@ class SearchSettings:
             raise TypeError(
                 f"include_policy_action must be True or False, got {self.include_policy_action!r}."
             )
-        if self.forward_model not in FORWARD_MODELS:
-            raise ValueError(f"forward_model must be one of {FORWARD_MODELS}, got {self.forward_model!r}.")
+        if self.forward_model not in KINDS:
+            raise ValueError(f"forward_model must be one of {KINDS}, got {self.forward_model!r}.")
 
     @property
     def effective_rollout_noise(self) -> float:
