@@ -1,5 +1,6 @@
 """TD3 that looks ahead before it acts."""
 
+import logging
 import time
 from typing import Any, TypeVar
 
@@ -13,7 +14,11 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from stable_baselines3.td3.policies import TD3Policy
 
 from sb3_mcbs.algorithms.searcher import Searcher
+from sb3_mcbs.algorithms.td3_update import TD3Update
+from sb3_mcbs.algorithms.torch_settings import matmul_precision
 from sb3_mcbs.search import SearchResult, SearchSettings
+
+logger = logging.getLogger("sb3_mcbs")
 
 SelfMCBSTD3 = TypeVar("SelfMCBSTD3", bound="MCBSTD3")
 
@@ -73,6 +78,10 @@ class MCBSTD3(TD3):
     :param action_noise_after_search: add ``action_noise`` to searched actions too
     :param n_threads: threads that simulate (0: one per available core); the result does not depend on it
     :param forward_model: ``"auto"``, ``"mujoco"`` or ``"pool"``, see the documentation of forward models
+    :param matmul_precision: internal precision of float32 matrix products in search and gradient steps, as in
+        ``torch.set_float32_matmul_precision`` (``"highest"``, ``"high"`` or ``"medium"``); None: as it is
+    :param fast_update: do gradient steps with SB3's mathematics but fewer instructions, where the networks
+        are plain MLPs; others use SB3's own
     """
 
     def __init__(
@@ -113,6 +122,8 @@ class MCBSTD3(TD3):
         action_noise_after_search: bool = False,
         n_threads: int = 0,
         forward_model: str = "auto",
+        matmul_precision: str | None = None,
+        fast_update: bool = True,
     ) -> None:
         super().__init__(
             policy,
@@ -151,6 +162,8 @@ class MCBSTD3(TD3):
         self.action_noise_after_search = action_noise_after_search
         self.n_threads = n_threads
         self.forward_model = forward_model
+        self.matmul_precision = matmul_precision
+        self.fast_update = fast_update
 
         self.search_rng: np.random.Generator | None = None
         self.n_decisions = 0
@@ -158,6 +171,7 @@ class MCBSTD3(TD3):
         self.n_invalid_rollouts = 0
         self._searcher: Searcher | None = None
         self._decision: SearchResult | None = None
+        self._update: TD3Update | None = None
 
         if _init_setup_model:
             self._setup_model()
@@ -170,15 +184,27 @@ class MCBSTD3(TD3):
     def _setup_model(self) -> None:
         # ``load`` sets attributes without calling the constructor, so settings are checked here.
         settings = self.search_settings
-        if not isinstance(self.action_noise_after_search, bool):
-            raise TypeError(
-                f"action_noise_after_search must be True or False, got {self.action_noise_after_search!r}."
-            )
+        for name in ("action_noise_after_search", "fast_update"):
+            if not isinstance(getattr(self, name), bool):
+                raise TypeError(f"{name} must be True or False, got {getattr(self, name)!r}.")
         super()._setup_model()
+        self._update = self._make_update()
         if self.search_rng is None:
             self.search_rng = np.random.default_rng(self.seed)
         if self.env is not None:
             self._make_searcher(self.env, settings)
+
+    def _make_update(self) -> TD3Update | None:
+        if not self.fast_update:
+            return None
+        try:
+            return TD3Update(self)
+        except TypeError as reason:
+            message = f"Gradient steps are SB3's own, not the fast ones: {reason}."
+            logger.info(message)
+            if self.verbose >= 1:
+                print(message)
+            return None
 
     def _make_searcher(self, env: VecEnv, settings: SearchSettings) -> None:
         if self._searcher is not None:
@@ -250,6 +276,19 @@ class MCBSTD3(TD3):
                 self.logger.record_mean("search/model_error", error)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
+    def train(self, gradient_steps: int, batch_size: int = 100) -> None:
+        """
+        Update the networks as TD3 does.
+
+        :param gradient_steps: how many gradient steps to do
+        :param batch_size: transitions sampled for each
+        """
+        with matmul_precision(self.matmul_precision):
+            if self._update is None:
+                super().train(gradient_steps, batch_size)
+            else:
+                self._update.train(gradient_steps, batch_size)
+
     def _record_decision(self, result: SearchResult, seconds: float) -> None:
         n_envs = len(result.chosen)
         self.n_decisions += n_envs
@@ -304,4 +343,4 @@ class MCBSTD3(TD3):
         return super().predict(observation, state, episode_start, deterministic)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_searcher", "_decision"]
+        return [*super()._excluded_save_params(), "_searcher", "_decision", "_update"]

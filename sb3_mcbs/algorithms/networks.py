@@ -1,17 +1,28 @@
 """The networks of any trained SB3 off-policy agent as two functions on arrays."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from sb3_contrib import TQC
+from sb3_contrib.tqc.policies import Actor as TQCActor
+from sb3_contrib.tqc.policies import Critic as TQCCritic
 from stable_baselines3 import DDPG, SAC, TD3
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import ContinuousCritic
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.utils import obs_as_tensor
+from stable_baselines3.sac.policies import Actor as SACActor
+from stable_baselines3.td3.policies import Actor as TD3Actor
+from torch import nn
 
+from sb3_mcbs.algorithms.mlp import MLP
 from sb3_mcbs.models.base import Observations
+
+_T = TypeVar("_T")
 
 SUPPORTED = (TD3, DDPG, SAC, TQC)
 
@@ -32,6 +43,61 @@ def check_agent(agent: OffPolicyAlgorithm) -> None:
         raise ValueError(f"A search needs a continuous (Box) action space, got {agent.action_space}.")
 
 
+def _check_plain(network: Any) -> None:
+    """Refuse an actor or critic that does more than flatten observations and call its layers."""
+    space = network.observation_space
+    if not isinstance(space, spaces.Box) or (network.normalize_images and is_image_space(space)):
+        raise TypeError("observations are not vectors of numbers")
+    if type(network.features_extractor) is not FlattenExtractor:
+        raise TypeError(f"features are extracted by a {type(network.features_extractor).__name__}")
+    for module in network.modules():
+        hooks = module._forward_hooks or module._forward_pre_hooks or module._backward_hooks
+        if hooks or "forward" in vars(module):
+            raise TypeError(f"a {type(module).__name__} has hooks or a replaced forward method")
+
+
+def actor_mlp(actor: Any) -> MLP:
+    """An actor's deterministic action as an MLP.
+
+    :param actor: an SB3 actor.
+    :return: float32 observations ``[obs_dim, rows]`` -> actions ``[act_dim, rows]`` in [-1, 1].
+    :raises TypeError: if the actor is more than an MLP.
+    """
+    _check_plain(actor)
+    if type(actor) is TD3Actor:
+        return MLP(actor.mu)
+    if type(actor) in (SACActor, TQCActor) and not actor.use_sde:
+        return MLP(actor.latent_pi, actor.mu, nn.Tanh())
+    raise TypeError(f"{type(actor).__name__} is not an actor of a known kind")
+
+
+def critic_mlps(critic: Any) -> list[MLP]:
+    """The single networks of a critic.
+
+    :param critic: an SB3 critic.
+    :return: each: float32 observations above actions ``[obs_dim + act_dim, rows]`` -> ``[1, rows]`` or
+        quantiles ``[n_quantiles, rows]``.
+    :raises TypeError: if the critic is more than MLPs.
+    """
+    _check_plain(critic)
+    if type(critic) not in (ContinuousCritic, TQCCritic):
+        raise TypeError(f"{type(critic).__name__} is not a critic of a known kind")
+    return [MLP(network) for network in critic.q_networks]
+
+
+def _or_none(make: Callable[[Any], _T], network: Any) -> _T | None:
+    try:
+        return make(network)
+    except TypeError:
+        return None
+
+
+def _columns(*arrays: np.ndarray, device: th.device) -> th.Tensor:
+    """``[rows, ...]`` arrays side by side as float32 ``[features, rows]``."""
+    flat = [array.reshape(len(array), -1).T for array in arrays]
+    return th.as_tensor(np.concatenate(flat, dtype=np.float32, casting="same_kind"), device=device)
+
+
 def policy_function(agent: OffPolicyAlgorithm) -> Callable[[Observations], np.ndarray]:
     """The actor without exploration: its output (TD3, DDPG) or its squashed mean (SAC, TQC).
 
@@ -40,13 +106,21 @@ def policy_function(agent: OffPolicyAlgorithm) -> Callable[[Observations], np.nd
     """
     policy_network: Any = agent.policy
     stochastic = isinstance(agent, SAC | TQC)
+    known: nn.Module | None = None
+    mlp: MLP | None = None
 
+    @th.inference_mode()
     def policy(observations: Observations) -> np.ndarray:
-        with th.no_grad():
-            tensor = obs_as_tensor(observations, agent.device)
-            actor = policy_network.actor
-            actions = actor(tensor, deterministic=True) if stochastic else actor(tensor)
-            return actions.cpu().numpy()
+        nonlocal known, mlp
+        actor = policy_network.actor
+        if actor is not known:
+            known, mlp = actor, _or_none(actor_mlp, actor)
+        if mlp is not None:
+            assert isinstance(observations, np.ndarray)
+            return mlp(_columns(observations, device=agent.device)).cpu().numpy().T
+        tensor = obs_as_tensor(observations, agent.device)
+        actions = actor(tensor, deterministic=True) if stochastic else actor(tensor)
+        return actions.cpu().numpy()
 
     return policy
 
@@ -59,13 +133,24 @@ def value_function(agent: OffPolicyAlgorithm) -> Callable[[Observations, np.ndar
     """
     policy_network: Any = agent.policy
     quantiles = isinstance(agent, TQC)
+    known: nn.Module | None = None
+    mlps: list[MLP] | None = None
 
+    @th.inference_mode()
     def value(observations: Observations, actions: np.ndarray) -> np.ndarray:
-        with th.no_grad():
-            tensor = obs_as_tensor(observations, agent.device)
-            estimates = policy_network.critic(tensor, th.as_tensor(actions, device=agent.device))
-            if quantiles:
-                return estimates.mean(dim=(1, 2)).cpu().numpy()
-            return th.cat(estimates, dim=1).amin(dim=1).cpu().numpy()
+        nonlocal known, mlps
+        critic = policy_network.critic
+        if critic is not known:
+            known, mlps = critic, _or_none(critic_mlps, critic)
+        if mlps is not None:
+            assert isinstance(observations, np.ndarray)
+            inputs = _columns(observations, actions, device=agent.device)
+            columns = th.cat([mlp(inputs) for mlp in mlps])
+            return (columns.mean(dim=0) if quantiles else columns.amin(dim=0)).cpu().numpy()
+        tensor = obs_as_tensor(observations, agent.device)
+        estimates = critic(tensor, th.as_tensor(actions, device=agent.device))
+        if quantiles:
+            return estimates.mean(dim=(1, 2)).cpu().numpy()
+        return th.cat(estimates, dim=1).amin(dim=1).cpu().numpy()
 
     return value

@@ -2,17 +2,15 @@
 
 import logging
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
-import torch as th
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_mcbs.algorithms.networks import check_agent, policy_function, value_function
+from sb3_mcbs.algorithms.torch_settings import matmul_precision, one_thread
 from sb3_mcbs.algorithms.vec_env_view import VecEnvView, reward_normalizer, snapshot_environments
 from sb3_mcbs.models import Environments, ForwardModel, ForwardModelError, make_forward_model
 from sb3_mcbs.models.base import Observations
@@ -46,13 +44,13 @@ class Searcher:
         self.settings = settings
         self._action_shape = agent.action_space.shape or ()
         self.model: ForwardModel | None = None
-        self._policy, self._value = policy_function(agent), value_function(agent)
         self._previous_step_differed = False
         if settings.rollout_depth > 0:
             self.view = VecEnvView(vec_env, reward_normalizer(agent.get_env(), vec_env, normalize_reward))
             self.environments: Environments = snapshot_environments(self.view.base)
             self._env_indices = range(len(self.environments))
             self.model = make_forward_model(self.environments, settings.forward_model, settings.n_threads)
+        self._functions = self._agent_functions()
 
     @property
     def description(self) -> str:
@@ -76,7 +74,7 @@ class Searcher:
         n_envs = _n_rows(observations)
         act_dim = get_action_dim(self.agent.action_space)
         noise = draw_noise(rng, self.settings, n_envs, act_dim)
-        with _one_torch_thread():
+        with one_thread(), matmul_precision(self.settings.matmul_precision):
             return beam_search(
                 self.model, roots, observations, self.agent_functions(), self.settings, noise, rng
             )
@@ -125,13 +123,17 @@ class Searcher:
 
     def agent_functions(self) -> Agent:
         """The agent as the search knows it: functions of the environments' own observations."""
+        return self._functions._replace(gamma=self.agent.gamma)
+
+    def _agent_functions(self) -> Agent:
+        policy, value, gamma = policy_function(self.agent), value_function(self.agent), self.agent.gamma
         if self.model is None:
-            return Agent(self._policy, self._value, self.agent.gamma, self.unscale, lambda rewards: rewards)
+            return Agent(policy, value, gamma, self.unscale, lambda rewards: rewards)
         observe = self.view.observe
         return Agent(
-            policy=lambda observations: self._policy(observe(observations)),
-            value=lambda observations, actions: self._value(observe(observations), actions),
-            gamma=self.agent.gamma,
+            policy=lambda observations: policy(observe(observations)),
+            value=lambda observations, actions: value(observe(observations), actions),
+            gamma=gamma,
             unscale_action=self.unscale,
             scale_reward=self.view.scale_reward,
         )
@@ -199,20 +201,6 @@ class Searcher:
     def _warn(message: str) -> None:
         logger.warning(message)
         warnings.warn(message, stacklevel=4)
-
-
-@contextmanager
-def _one_torch_thread() -> Iterator[None]:
-    """Torch's idle threads spin between calls, on the cores that the simulation needs."""
-    n_threads = th.get_num_threads()
-    if n_threads == 1:
-        yield
-        return
-    th.set_num_threads(1)
-    try:
-        yield
-    finally:
-        th.set_num_threads(n_threads)
 
 
 def _last_observation(env: SnapshotEnvWrapper) -> Any:

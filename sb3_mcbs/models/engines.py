@@ -100,12 +100,12 @@ class Engine(ABC):
         """``[capacity, ...]`` of a field that a step computes."""
 
     @abstractmethod
-    def step(self, rows: int, n_substeps: int) -> np.ndarray:
+    def step(self, rows: int, n_substeps: int) -> np.ndarray | None:
         """Step the first rows.
 
         :param rows: how many.
         :param n_substeps: MuJoCo steps.
-        :return: ``[rows]`` bool, True where the simulation diverged.
+        :return: ``[rows]`` bool, True where the simulation diverged; ``None`` if none did.
         """
 
     def close(self) -> None:  # noqa: B027
@@ -132,17 +132,19 @@ class BatchEngine(Engine):
     def _derived_field(self, name: str) -> np.ndarray:
         return self._derived[name]
 
-    def step(self, rows: int, n_substeps: int) -> np.ndarray:
+    def step(self, rows: int, n_substeps: int) -> np.ndarray | None:
         warning = self._warning[:rows]
-        warning[...] = 0
-        failed: Sequence[int] | np.ndarray = ()
+        failed = None
         try:
             self._batch.step(self._ids[:rows], n_substeps)
         except SimulationError as error:
             failed = error.ids
+        if failed is None and not warning.any():
+            return None
         diverged: np.ndarray = warning.any(axis=1)
-        if len(failed):
+        if failed is not None:
             diverged[failed] = True
+        warning[...] = 0
         return diverged
 
 
@@ -173,7 +175,7 @@ class ThreadEngine(Engine):
     def _derived_field(self, name: str) -> np.ndarray:
         return self._derived[name]
 
-    def step(self, rows: int, n_substeps: int) -> np.ndarray:
+    def step(self, rows: int, n_substeps: int) -> np.ndarray | None:
         # The iterator is what the threads share: each takes the next row that nobody has.
         todo = iter(range(rows))
         helpers = []
@@ -183,7 +185,8 @@ class ThreadEngine(Engine):
         self._work(0, todo, n_substeps)
         for helper in helpers:
             helper.result()
-        return self._diverged[:rows].copy()
+        diverged = self._diverged[:rows]
+        return diverged.copy() if diverged.any() else None
 
     def _work(self, thread: int, todo: Iterator[int], n_substeps: int) -> None:
         model, data, sources = self.model, self._datas[thread], self._sources[thread]

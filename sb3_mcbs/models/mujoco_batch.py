@@ -1,5 +1,6 @@
 """The forward model for known MuJoCo environments: physics on threads, the rest as array code."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -93,6 +94,7 @@ class MujocoBatchModel(ForwardModel):
         self._lagging = tuple(name for name in self._fields.before if not is_state_field(name))
         self._state_size = mujoco.mj_stateSize(known.constants.model, INTEGRATION)
         self._build(_FIRST_CAPACITY)
+        self._any_marked = False
         self._rows = 0
         n_threads = f"{self._n_threads} thread{'s' if self._n_threads > 1 else ''}"
         engine = type(self._engine).__name__
@@ -131,14 +133,9 @@ class MujocoBatchModel(ForwardModel):
         self._views: dict[int, tuple[Rows, Rows, np.ndarray]] = {}
 
     def _memory(self) -> list[np.ndarray]:
-        """Everything that a row is, as ``[capacity, ...]`` arrays."""
+        """Everything that a row is, as ``[capacity, ...]`` arrays, without its marks."""
         assert self._engine is not None
-        return [
-            self._engine.state,
-            *(self._before[name] for name in self._lagging),
-            self._diverged,
-            self._ended,
-        ]
+        return [self._engine.state, *(self._before[name] for name in self._lagging)]
 
     def _fill(self, values: Sequence[np.ndarray], rows: int) -> None:
         """Set the first rows' memory, on a larger engine if this one is too small."""
@@ -162,12 +159,16 @@ class MujocoBatchModel(ForwardModel):
             size = int(np.prod(shape))
             values.append(table[:, start : start + size].reshape(rows, *shape))
             start += size
-        no_row = np.zeros(rows, dtype=bool)
-        self._fill([*values, no_row, no_row], rows)
+        self._fill(values, rows)
+        self._diverged[...] = self._ended[...] = self._any_marked = False
 
     def select(self, index: np.ndarray) -> None:
         values = [memory[: self._rows].take(index, axis=0) for memory in self._memory()]
+        diverged, ended = self._diverged[: self._rows], self._ended[: self._rows]
         self._fill(values, len(index))
+        if self._any_marked:
+            self._diverged[: len(index)] = diverged[index]
+            self._ended[: len(index)] = ended[index]
 
     def _view(self, rows: int) -> tuple[Rows, Rows, np.ndarray]:
         """The fields of the first rows, before and after a step, and their controls."""
@@ -195,12 +196,34 @@ class MujocoBatchModel(ForwardModel):
         observations, rewards, terminated = self._family.transition(self._constants, before, after, actions)
         for name in self._lagging:
             self._before[name][:rows] = self._arrays[name][:rows]
-        if not (np.isfinite(observations).all() and np.isfinite(rewards).all()):
-            diverged |= ~(np.isfinite(observations).reshape(rows, -1).all(axis=1) & np.isfinite(rewards))
-        # What a simulation does after its end is nobody's concern, so it cannot make it invalid.
-        self._diverged[:rows] |= diverged & ~self._ended[:rows]
+        return Transition(
+            observations, rewards, terminated, self._mark(diverged, observations, rewards, terminated)
+        )
+
+    def _mark(
+        self,
+        diverged: np.ndarray | None,
+        observations: np.ndarray,
+        rewards: np.ndarray,
+        terminated: np.ndarray,
+    ) -> np.ndarray:
+        """Remember which rows are of no use any more, and which have ended.
+
+        :return: ``[rows]`` bool, which rows are valid.
+        """
+        rows = len(rewards)
+        # A sum is finite only if all its terms are; if it is not, each is looked at.
+        if not math.isfinite(observations.sum() + rewards.sum()):
+            broken = ~(np.isfinite(observations).reshape(rows, -1).all(axis=1) & np.isfinite(rewards))
+            diverged = broken if diverged is None else diverged | broken
+        if diverged is None and not self._any_marked and not terminated.any():
+            return np.ones(rows, dtype=bool)
+        self._any_marked = True
+        if diverged is not None:
+            # What a simulation does after its end is nobody's concern, so it cannot make it invalid.
+            self._diverged[:rows] |= diverged & ~self._ended[:rows]
         self._ended[:rows] |= terminated
-        return Transition(observations, rewards, terminated, ~self._diverged[:rows])
+        return ~self._diverged[:rows]
 
     def _check(self) -> None:
         """Compare with copies of the real environments on random transitions.

@@ -12,6 +12,8 @@ import numpy as np
 from sb3_mcbs.models.base import ForwardModel, Observations
 from sb3_mcbs.search.settings import SearchSettings
 
+_ALL = slice(None)
+
 
 class Agent(NamedTuple):
     """What a search has to know of the agent.
@@ -156,9 +158,10 @@ def _rollout_values(
 ) -> tuple[np.ndarray, FirstStep, int]:
     """Evaluate ShortHorizon for every environment, candidate and simulation.
 
-    All rollouts advance together. ``rollout_of_row`` names the unfinished rollouts, in order; the
-    forward model holds one row for each of them, except before the first step in a deterministic
-    environment, where the simulations of a candidate still share one.
+    All rollouts advance together. The forward model holds one row for each of the ``unfinished``
+    rollouts, in order, and then ``row_of`` is None; otherwise ``row_of`` says which row is whose:
+    the simulations of a candidate share one in the first step of a deterministic environment, and
+    rows of rollouts that ended are not yet dropped.
 
     :return: values ``[n_envs, beam, sim]`` in float64 (NaN where a simulation was invalid), the first step of
         every candidate ``[n_envs * beam]``, and the number of simulated steps.
@@ -168,11 +171,12 @@ def _rollout_values(
     if model.deterministic and settings.effective_rollout_noise == 0:
         n_sim = 1  # all simulations of a candidate would be the same
     n_first = 1 if model.deterministic else n_sim
-    rollout_noise = noise.rollout[:, :, :, :n_sim].reshape(depth_limit, n_envs * beam * n_sim, act_dim)
+    n_rollouts = n_envs * beam * n_sim
+    rollout_noise = noise.rollout[:, :, :, :n_sim].reshape(depth_limit, n_rollouts, act_dim)
 
-    returns = np.zeros(n_envs * beam * n_sim)
-    rollout_of_row = np.arange(n_envs * beam * n_sim)
-    row_of_rollout = rollout_of_row // (n_sim // n_first)
+    returns = np.zeros(n_rollouts)
+    unfinished: np.ndarray | slice = _ALL
+    row_of = np.arange(n_rollouts) // n_sim if n_first < n_sim else None
     discount = 1.0
     simulated_steps = 0
 
@@ -180,36 +184,41 @@ def _rollout_values(
     actions = np.repeat(candidates.reshape(-1, act_dim), n_first, axis=0)
     for depth in range(depth_limit):
         step = model.step(agent.unscale_action(actions))
+        observations = step.observations
         simulated_steps += len(actions)
         if depth == 0:
             first_step = FirstStep(
-                _take(step.observations, slice(None, None, n_first)), step.rewards[::n_first].copy()
+                _take(observations, slice(None, None, n_first)), step.rewards[::n_first].copy()
             )
-        rewards = np.where(step.valid, agent.scale_reward(step.rewards).astype(np.float64), np.nan)
-        returns[rollout_of_row] += discount * rewards[row_of_rollout]
+        rewards = agent.scale_reward(step.rewards)
+        all_valid = step.valid.all()
+        if not all_valid:
+            rewards = np.where(step.valid, rewards, np.nan)
+        returns[unfinished] += discount * _spread(rewards, row_of)
         discount *= agent.gamma
 
-        open_rows = step.valid & ~step.terminated
-        all_open = bool(open_rows.all())
-        if all_open:
-            observations = step.observations
-        else:
-            unfinished = open_rows[row_of_rollout]
-            rollout_of_row, row_of_rollout = rollout_of_row[unfinished], row_of_rollout[unfinished]
-            if not len(rollout_of_row):
-                break
-            observations = _take(step.observations, np.flatnonzero(open_rows))
         # Simulations of one candidate share their first observation: the policy sees it once.
-        observation_of_rollout = (np.cumsum(open_rows) - 1)[row_of_rollout]
-        actions = agent.policy(observations)[observation_of_rollout]
-        actions = np.clip(actions + rollout_noise[depth, rollout_of_row], -1.0, 1.0)
+        observation_of = row_of
+        if not all_valid or step.terminated.any():
+            open_rows = step.valid & ~step.terminated
+            rows = np.arange(len(open_rows)) if row_of is None else row_of
+            still_open = open_rows[rows]
+            row_of = rows[still_open]
+            unfinished = np.arange(n_rollouts)[unfinished][still_open]
+            if not len(row_of):
+                break
+            observations = _take(observations, open_rows)
+            observation_of = (np.cumsum(open_rows) - 1)[row_of]
+        actions = _spread(agent.policy(observations), observation_of) + rollout_noise[depth, unfinished]
+        np.clip(actions, -1.0, 1.0, out=actions)
         if depth + 1 < depth_limit:
-            if not (all_open and len(row_of_rollout) == len(open_rows)):
-                model.select(row_of_rollout)
-            row_of_rollout = np.arange(len(rollout_of_row))
+            if row_of is not None:
+                model.select(row_of)
+                row_of = None
         else:
-            last = agent.value(_take(observations, observation_of_rollout), actions)
-            returns[rollout_of_row] += discount * last.astype(np.float64)
+            if observation_of is not None:
+                observations = _take(observations, observation_of)
+            returns[unfinished] += discount * agent.value(observations, actions).astype(np.float64)
     return returns.reshape(n_envs, beam, n_sim), first_step, simulated_steps
 
 
@@ -232,6 +241,10 @@ def _gaussian(
     if clip is not None:
         np.clip(noise, -clip, clip, out=noise)
     return noise
+
+
+def _spread(values: np.ndarray, index: np.ndarray | None) -> np.ndarray:
+    return values if index is None else values[index]
 
 
 def _take(observations: Observations, index: np.ndarray | slice) -> Observations:

@@ -11,6 +11,7 @@ from sb3_mcbs.models.factory import KINDS
 MAX_ROLLOUTS = 100_000
 MAX_DEPTH = 10_000
 MAX_THREADS = 1024
+MATMUL_PRECISIONS = ("highest", "high", "medium")
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,9 @@ class SearchSettings:
         depend on it.
     :param forward_model: ``"auto"``, ``"mujoco"`` (batched MuJoCo) or ``"pool"`` (copies of the
         environment).
+    :param matmul_precision: internal precision of the networks' float32 products during a search, as in
+        ``torch.set_float32_matmul_precision``: ``"medium"`` is quicker on processors that multiply bfloat16.
+        ``None``: as the process has it.
     :raises TypeError: if a value has the wrong type.
     :raises ValueError: if a value is out of range.
     """
@@ -45,6 +49,7 @@ class SearchSettings:
     include_policy_action: bool = False
     n_threads: int = 0
     forward_model: str = "auto"
+    matmul_precision: str | None = None
 
     def __post_init__(self) -> None:
         _check_integer("beam_width", self.beam_width, 1, MAX_ROLLOUTS)
@@ -67,6 +72,10 @@ class SearchSettings:
             )
         if self.forward_model not in KINDS:
             raise ValueError(f"forward_model must be one of {KINDS}, got {self.forward_model!r}.")
+        if self.matmul_precision not in (None, *MATMUL_PRECISIONS):
+            raise ValueError(
+                f"matmul_precision must be one of {MATMUL_PRECISIONS} or None, got {self.matmul_precision!r}."
+            )
 
     @property
     def effective_rollout_noise(self) -> float:

@@ -1,0 +1,57 @@
+"""Settings of torch that hold for the whole process, changed for a while and put back."""
+
+import ctypes
+import functools
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import torch as th
+
+#: omp_pause_soft of the OpenMP 5.0 standard: free the threads, keep the settings.
+_OMP_PAUSE_SOFT = 1
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Leave the processor's cores to the simulation.
+
+    After work on several threads, torch's idle OpenMP threads spin for milliseconds on the cores that the
+    simulation needs, so they are released (torch starts them again when it wants them). What torch does in
+    between runs on one thread.
+    """
+    n_threads = th.get_num_threads()
+    if n_threads == 1:
+        yield
+        return
+    _openmp_pause()(_OMP_PAUSE_SOFT)
+    th.set_num_threads(1)
+    try:
+        yield
+    finally:
+        th.set_num_threads(n_threads)
+
+
+@functools.cache
+def _openmp_pause() -> Callable[[int], int]:
+    """``omp_pause_resource_all`` of the OpenMP library that torch uses; nothing where there is none."""
+    try:
+        return ctypes.CDLL(th._C.__file__).omp_pause_resource_all
+    except (AttributeError, OSError):  # built without OpenMP, or with one older than 5.0
+        return lambda kind: 0
+
+
+@contextmanager
+def matmul_precision(precision: str | None) -> Iterator[None]:
+    """Compute float32 matrix products with another internal precision.
+
+    :param precision: as in ``torch.set_float32_matmul_precision``; ``None`` changes nothing.
+    """
+    before = th.get_float32_matmul_precision()
+    if precision is None or precision == before:
+        yield
+        return
+    th.set_float32_matmul_precision(precision)
+    try:
+        yield
+    finally:
+        th.set_float32_matmul_precision(before)
