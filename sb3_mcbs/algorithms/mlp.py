@@ -18,21 +18,71 @@ def _flatten(modules: Iterable[nn.Module]) -> list[nn.Module]:
     return layers
 
 
+class _Linear:
+    """A linear layer's parameters, apart from autograd.
+
+    :param layer: the layer; a later change of its parameters' storage, as by ``to(device)``, is followed.
+    """
+
+    def __init__(self, layer: nn.Linear) -> None:
+        self._parameters: dict[str, Any] = layer._parameters
+        self._weight = self._bias = th.empty(0)
+
+    @property
+    def weight(self) -> th.Tensor:
+        """``[out_features, in_features]``."""
+        present = self._parameters["weight"]
+        if self._weight.data_ptr() != present.data_ptr():
+            self._weight = present.detach()
+        return self._weight
+
+    @property
+    def bias(self) -> th.Tensor | None:
+        """``[out_features, 1]``."""
+        present = self._parameters["bias"]
+        if present is None:
+            return None
+        if self._bias.data_ptr() != present.data_ptr():
+            self._bias = present.detach().unsqueeze(1)
+        return self._bias
+
+    def set_gradients(self, layer_input: th.Tensor, gradient: th.Tensor) -> None:
+        """Set the parameters' ``grad``.
+
+        :param layer_input: ``[in_features, rows]``.
+        :param gradient: of the loss, by the layer's output: ``[out_features, rows]``.
+        """
+        weight, bias = self._parameters["weight"], self._parameters["bias"]
+        th.mm(gradient, layer_input.t(), out=_gradient_of(weight))
+        if bias is not None:
+            th.sum(gradient, 1, out=_gradient_of(bias))
+
+
+def _gradient_of(parameter: nn.Parameter) -> th.Tensor:
+    if parameter.grad is None:
+        parameter.grad = th.empty_like(parameter)
+    return parameter.grad
+
+
 class MLP:
-    """Linear layers with ReLU and Tanh between them.
+    """Linear layers with ReLU and Tanh between them. Nothing here is recorded by autograd.
 
     :param modules: ``nn.Sequential``s and single layers; their present parameters are used at every call.
     :raises TypeError: if a layer is of another kind.
     """
 
     def __init__(self, *modules: nn.Module) -> None:
-        self._layers: list[tuple[type[nn.Module], dict[str, Any]]] = []
+        self._layers: list[_Linear | type[nn.Module]] = []
         for layer in _flatten(modules):
-            if type(layer) not in (nn.Linear, nn.ReLU, nn.Tanh):
-                raise TypeError(f"{type(layer).__name__} is not one of the layers Linear, ReLU and Tanh")
-            self._layers.append((type(layer), layer._parameters))
-        if not self._layers or self._layers[0][0] is not nn.Linear:
-            raise TypeError("the first layer is not linear")
+            if type(layer) is nn.Linear:
+                self._layers.append(_Linear(layer))
+            elif type(layer) in (nn.ReLU, nn.Tanh) and self._layers:
+                self._layers.append(type(layer))
+            else:
+                raise TypeError(
+                    f"{type(layer).__name__} is not covered; an MLP begins with Linear and goes on with "
+                    "Linear, ReLU and Tanh"
+                )
 
     def __call__(self, x: th.Tensor) -> th.Tensor:
         """Run all layers.
@@ -49,13 +99,14 @@ class MLP:
         :return: the output of every layer, ``[features, rows]``. An activation overwrites its input.
         """
         outputs = []
-        for kind, parameters in self._layers:
-            if kind is nn.Linear:
-                x = th.mm(parameters["weight"], x)
-                if parameters["bias"] is not None:
-                    x += parameters["bias"].unsqueeze(1)
+        for layer in self._layers:
+            if isinstance(layer, _Linear):
+                x = th.mm(layer.weight, x)
+                bias = layer.bias
+                if bias is not None:
+                    x += bias
             else:
-                x = x.relu_() if kind is nn.ReLU else x.tanh_()
+                x = x.relu_() if layer is nn.ReLU else x.tanh_()
             outputs.append(x)
         return outputs
 
@@ -72,25 +123,16 @@ class MLP:
         :return: the gradient by the input, ``[in_features, rows]``, if ``of_parameters`` is False.
         """
         for index in range(len(self._layers) - 1, -1, -1):
-            kind, parameters = self._layers[index]
-            if kind is nn.ReLU:
+            layer = self._layers[index]
+            if isinstance(layer, _Linear):
+                if of_parameters:
+                    layer.set_gradients(outputs[index - 1] if index else x, gradient)
+                if index or not of_parameters:
+                    gradient = th.mm(layer.weight.t(), gradient)
+            elif layer is nn.ReLU:
                 gradient = th.ops.aten.threshold_backward.grad_input(
                     gradient, outputs[index], 0, grad_input=gradient
                 )
-            elif kind is nn.Tanh:
-                gradient = th.ops.aten.tanh_backward(gradient, outputs[index])
             else:
-                if of_parameters:
-                    layer_input = outputs[index - 1] if index else x
-                    th.mm(gradient, layer_input.t(), out=_gradient_of(parameters["weight"]))
-                    if parameters["bias"] is not None:
-                        th.sum(gradient, 1, out=_gradient_of(parameters["bias"]))
-                if index or not of_parameters:
-                    gradient = th.mm(parameters["weight"].t(), gradient)
+                gradient = th.ops.aten.tanh_backward(gradient, outputs[index])
         return gradient
-
-
-def _gradient_of(parameter: nn.Parameter) -> th.Tensor:
-    if parameter.grad is None:
-        parameter.grad = th.empty_like(parameter)
-    return parameter.grad

@@ -1,5 +1,6 @@
 """The networks of any trained SB3 off-policy agent as two functions on arrays."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -92,10 +93,16 @@ def _or_none(make: Callable[[Any], _T], network: Any) -> _T | None:
         return None
 
 
-def _columns(*arrays: np.ndarray, device: th.device) -> th.Tensor:
+def _columns(first: np.ndarray, second: np.ndarray | None, device: th.device) -> th.Tensor:
     """``[rows, ...]`` arrays side by side as float32 ``[features, rows]``."""
-    flat = [array.reshape(len(array), -1).T for array in arrays]
-    return th.as_tensor(np.concatenate(flat, dtype=np.float32, casting="same_kind"), device=device)
+    first = first.reshape(len(first), -1).T
+    if second is None:
+        columns = np.array(first, dtype=np.float32, order="C")
+    else:
+        columns = np.empty((len(first) + second.shape[1], len(second)), dtype=np.float32)
+        columns[: len(first)] = first
+        columns[len(first) :] = second.T
+    return th.from_numpy(columns).to(device)
 
 
 def policy_function(agent: OffPolicyAlgorithm) -> Callable[[Observations], np.ndarray]:
@@ -109,7 +116,6 @@ def policy_function(agent: OffPolicyAlgorithm) -> Callable[[Observations], np.nd
     known: nn.Module | None = None
     mlp: MLP | None = None
 
-    @th.inference_mode()
     def policy(observations: Observations) -> np.ndarray:
         nonlocal known, mlp
         actor = policy_network.actor
@@ -117,10 +123,11 @@ def policy_function(agent: OffPolicyAlgorithm) -> Callable[[Observations], np.nd
             known, mlp = actor, _or_none(actor_mlp, actor)
         if mlp is not None:
             assert isinstance(observations, np.ndarray)
-            return mlp(_columns(observations, device=agent.device)).cpu().numpy().T
-        tensor = obs_as_tensor(observations, agent.device)
-        actions = actor(tensor, deterministic=True) if stochastic else actor(tensor)
-        return actions.cpu().numpy()
+            return mlp(_columns(observations, None, agent.device)).cpu().numpy().T
+        with th.no_grad():
+            tensor = obs_as_tensor(observations, agent.device)
+            actions = actor(tensor, deterministic=True) if stochastic else actor(tensor)
+            return actions.cpu().numpy()
 
     return policy
 
@@ -136,7 +143,6 @@ def value_function(agent: OffPolicyAlgorithm) -> Callable[[Observations, np.ndar
     known: nn.Module | None = None
     mlps: list[MLP] | None = None
 
-    @th.inference_mode()
     def value(observations: Observations, actions: np.ndarray) -> np.ndarray:
         nonlocal known, mlps
         critic = policy_network.critic
@@ -144,13 +150,16 @@ def value_function(agent: OffPolicyAlgorithm) -> Callable[[Observations, np.ndar
             known, mlps = critic, _or_none(critic_mlps, critic)
         if mlps is not None:
             assert isinstance(observations, np.ndarray)
-            inputs = _columns(observations, actions, device=agent.device)
-            columns = th.cat([mlp(inputs) for mlp in mlps])
-            return (columns.mean(dim=0) if quantiles else columns.amin(dim=0)).cpu().numpy()
-        tensor = obs_as_tensor(observations, agent.device)
-        estimates = critic(tensor, th.as_tensor(actions, device=agent.device))
-        if quantiles:
-            return estimates.mean(dim=(1, 2)).cpu().numpy()
-        return th.cat(estimates, dim=1).amin(dim=1).cpu().numpy()
+            inputs = _columns(observations, actions, agent.device)
+            columns = [mlp(inputs) for mlp in mlps]
+            if quantiles:
+                return th.cat(columns).mean(dim=0).cpu().numpy()
+            return functools.reduce(th.minimum, columns)[0].cpu().numpy()
+        with th.no_grad():
+            tensor = obs_as_tensor(observations, agent.device)
+            estimates = critic(tensor, th.as_tensor(actions, device=agent.device))
+            if quantiles:
+                return estimates.mean(dim=(1, 2)).cpu().numpy()
+            return th.cat(estimates, dim=1).amin(dim=1).cpu().numpy()
 
     return value

@@ -43,6 +43,7 @@ class Searcher:
         self.agent = agent
         self.settings = settings
         self._action_shape = agent.action_space.shape or ()
+        self._act_dim = get_action_dim(agent.action_space)
         self.model: ForwardModel | None = None
         self._previous_step_differed = False
         if settings.rollout_depth > 0:
@@ -71,9 +72,7 @@ class Searcher:
         if self.model is not None:
             roots = self._read_roots()
             observations = self._present_observations(observations)
-        n_envs = _n_rows(observations)
-        act_dim = get_action_dim(self.agent.action_space)
-        noise = draw_noise(rng, self.settings, n_envs, act_dim)
+        noise = draw_noise(rng, self.settings, _n_rows(observations), self._act_dim)
         with one_thread(), matmul_precision(self.settings.matmul_precision):
             return beam_search(
                 self.model, roots, observations, self.agent_functions(), self.settings, noise, rng
@@ -220,7 +219,8 @@ def _n_rows(observations: Observations) -> int:
 def _equal(left: Observations, right: Observations) -> bool:
     if isinstance(left, dict):
         return isinstance(right, dict) and all(np.array_equal(left[key], right[key]) for key in left)
-    return not isinstance(right, dict) and np.array_equal(left, right)
+    # What np.array_equal does, without its Python.
+    return not isinstance(right, dict) and left.shape == right.shape and bool((left == right).all())
 
 
 def _difference(left: Any, right: Any) -> float:

@@ -46,10 +46,10 @@ def matmul_precision(precision: str | None) -> Iterator[None]:
 
     :param precision: as in ``torch.set_float32_matmul_precision``; ``None`` changes nothing.
     """
-    before = th.get_float32_matmul_precision()
-    if precision is None or precision == before:
+    if precision is None:
         yield
         return
+    before = th.get_float32_matmul_precision()
     th.set_float32_matmul_precision(precision)
     try:
         yield

@@ -117,7 +117,7 @@ def beam_search(
     :return: actions, and what the search found.
     """
     policy_actions = agent.policy(observations)
-    candidates = np.clip(policy_actions[:, None] + noise.beam, -1.0, 1.0)
+    candidates = _clip(policy_actions[:, None] + noise.beam)
     if settings.include_policy_action:
         candidates[:, 0] = policy_actions
 
@@ -209,8 +209,8 @@ def _rollout_values(
                 break
             observations = _take(observations, open_rows)
             observation_of = (np.cumsum(open_rows) - 1)[row_of]
-        actions = _spread(agent.policy(observations), observation_of) + rollout_noise[depth, unfinished]
-        np.clip(actions, -1.0, 1.0, out=actions)
+        actions = _spread(agent.policy(observations), observation_of)
+        actions = _clip(actions + rollout_noise[depth, unfinished])
         if depth + 1 < depth_limit:
             if row_of is not None:
                 model.select(row_of)
@@ -241,6 +241,11 @@ def _gaussian(
     if clip is not None:
         np.clip(noise, -clip, clip, out=noise)
     return noise
+
+
+def _clip(actions: np.ndarray) -> np.ndarray:
+    """Clip to [-1, 1] in place; two ufuncs are quicker than ``np.clip``."""
+    return np.maximum(np.minimum(actions, 1, out=actions), -1, out=actions)
 
 
 def _spread(values: np.ndarray, index: np.ndarray | None) -> np.ndarray:
