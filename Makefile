@@ -4,6 +4,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.sb3-mcbs-installed
 
 .PHONY: help install train test test-slow lint format evidence clean
+.PHONY: bench-search bench-training bench-scaling bench-memory bench-deadline
 
 help:
 	@echo "make train      set up $(VENV), train MCBS-TD3 on HalfCheetah-v5 for 20 000 steps, report"
@@ -11,6 +12,7 @@ help:
 	@echo "make test-slow  the tests that build packages or take long"
 	@echo "make lint       ruff and mypy"
 	@echo "make format     ruff format, and what ruff check can repair"
+	@echo "make bench-search, bench-training, bench-scaling, bench-memory, bench-deadline: see docs/speed.md"
 	@echo "make evidence   TD3 against MCBS-TD3, three seeds each (about an hour on two cores)"
 
 $(BIN)/python:
@@ -44,6 +46,18 @@ format: $(STAMP)
 
 evidence: $(STAMP)
 	$(BIN)/python benchmarks/first_evidence.py
+
+bench-search bench-scaling bench-memory bench-deadline: bench-%: $(STAMP)
+	$(BIN)/python -m benchmarks.$*
+
+# SBX (JAX) is a peer to be measured against; it is kept apart.
+.venv-sbx/bin/python: benchmarks/requirements-sbx.txt
+	$(PYTHON) -m venv .venv-sbx
+	.venv-sbx/bin/python -m pip install --quiet -r $<
+	touch $@
+
+bench-training: $(STAMP) .venv-sbx/bin/python
+	$(BIN)/python -m benchmarks.training --sbx-python .venv-sbx/bin/python
 
 clean:
 	rm -rf build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache

@@ -80,6 +80,9 @@ class MCBSTD3(TD3):
     :param forward_model: ``"auto"``, ``"mujoco"`` or ``"pool"``, see the documentation of forward models
     :param matmul_precision: internal precision of float32 matrix products in search and gradient steps, as in
         ``torch.set_float32_matmul_precision`` (``"highest"``, ``"high"`` or ``"medium"``); None: as it is
+    :param time_budget: seconds that a decision may take; candidates are then evaluated in rounds until the
+        time is used, and runs are not reproducible; None: all candidates, however long it takes
+    :param max_beam_width: with ``time_budget``, evaluate up to so many candidates; None: ``beam_width``
     :param fast_update: do gradient steps with SB3's mathematics but fewer instructions, where the networks
         are plain MLPs; others use SB3's own
     """
@@ -123,6 +126,8 @@ class MCBSTD3(TD3):
         n_threads: int = 0,
         forward_model: str = "auto",
         matmul_precision: str | None = None,
+        time_budget: float | None = None,
+        max_beam_width: int | None = None,
         fast_update: bool = True,
     ) -> None:
         super().__init__(
@@ -163,6 +168,8 @@ class MCBSTD3(TD3):
         self.n_threads = n_threads
         self.forward_model = forward_model
         self.matmul_precision = matmul_precision
+        self.time_budget = time_budget
+        self.max_beam_width = max_beam_width
         self.fast_update = fast_update
 
         self.search_rng: np.random.Generator | None = None
@@ -302,6 +309,9 @@ class MCBSTD3(TD3):
             )
             self.logger.record_mean("search/beam_std", float(values.std(axis=1).mean()))
         self.logger.record_mean("search/ms_per_decision", 1000 * seconds / n_envs)
+        if self.time_budget is not None:
+            self.logger.record_mean("search/rounds", result.rounds)
+            self.logger.record_mean("search/candidates", result.values.shape[1])
         self.logger.record("search/decisions", self.n_decisions)
         self.logger.record("search/simulated_steps", self.n_simulated_steps)
         self.logger.record("search/invalid_rollouts", self.n_invalid_rollouts)

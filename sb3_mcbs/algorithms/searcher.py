@@ -15,7 +15,15 @@ from sb3_mcbs.algorithms.vec_env_view import VecEnvView, reward_normalizer, snap
 from sb3_mcbs.models import Environments, ForwardModel, ForwardModelError, make_forward_model
 from sb3_mcbs.models.base import Observations
 from sb3_mcbs.models.copies import stack
-from sb3_mcbs.search import Agent, SearchResult, SearchSettings, beam_search, draw_noise
+from sb3_mcbs.search import (
+    Agent,
+    Pace,
+    SearchResult,
+    SearchSettings,
+    beam_search,
+    deadline_search,
+    draw_noise,
+)
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 
 logger = logging.getLogger("sb3_mcbs")
@@ -46,6 +54,7 @@ class Searcher:
         self._act_dim = get_action_dim(agent.action_space)
         self.model: ForwardModel | None = None
         self._previous_step_differed = False
+        self._pace = Pace()
         if settings.rollout_depth > 0:
             self.view = VecEnvView(vec_env, reward_normalizer(agent.get_env(), vec_env, normalize_reward))
             self.environments: Environments = snapshot_environments(self.view.base)
@@ -66,16 +75,22 @@ class Searcher:
         :return: actions, and what the search found.
         :raises ValueError: if the observations are not those of the environments' present states.
         """
+        start = self._pace.clock()
         if self.agent.policy.training:
             self.agent.policy.set_training_mode(False)
         roots: list[Any] = []
         if self.model is not None:
             roots = self._read_roots()
             observations = self._present_observations(observations)
-        noise = draw_noise(rng, self.settings, _n_rows(observations), self._act_dim)
-        with one_thread(), matmul_precision(self.settings.matmul_precision):
-            return beam_search(
-                self.model, roots, observations, self.agent_functions(), self.settings, noise, rng
+        agent, settings = self.agent_functions(), self.settings
+        with one_thread(), matmul_precision(settings.matmul_precision):
+            if settings.time_budget is None:
+                noise = draw_noise(rng, settings, _n_rows(observations), self._act_dim)
+                return beam_search(self.model, roots, observations, agent, settings, noise, rng)
+            assert self.model is not None
+            deadline = start + settings.time_budget
+            return deadline_search(
+                self.model, roots, observations, agent, settings, deadline, self._pace, rng
             )
 
     def model_error(

@@ -68,6 +68,7 @@ class SearchResult(NamedTuple):
         ``None`` if nothing was simulated. Meaningless where ``chosen`` is -1.
     :param simulated_steps: environment steps that were simulated, each counted once.
     :param invalid_rollouts: rollouts that diverged or whose value is not finite.
+    :param rounds: finished rounds: 1, or any number if the search had a time budget.
     """
 
     actions: np.ndarray
@@ -77,6 +78,18 @@ class SearchResult(NamedTuple):
     first_step: FirstStep | None
     simulated_steps: int
     invalid_rollouts: int
+    rounds: int = 1
+
+
+class OutOfTimeError(Exception):
+    """A round was given up before its rollouts were finished.
+
+    :ivar simulated_steps: what it had simulated until then.
+    """
+
+    def __init__(self, simulated_steps: int) -> None:
+        super().__init__(f"given up after {simulated_steps} simulated steps")
+        self.simulated_steps = simulated_steps
 
 
 def draw_noise(rng: np.random.Generator, settings: SearchSettings, n_envs: int, act_dim: int) -> Noise:
@@ -117,19 +130,44 @@ def beam_search(
     :return: actions, and what the search found.
     """
     policy_actions = agent.policy(observations)
-    candidates = _clip(policy_actions[:, None] + noise.beam)
-    if settings.include_policy_action:
-        candidates[:, 0] = policy_actions
-
+    candidates = propose(policy_actions, noise.beam, settings.include_policy_action)
     if settings.rollout_depth == 0:
         values = _critic_values(observations, candidates, agent)[..., None]
-        first_step, simulated_steps = None, 0
-    else:
-        assert model is not None, "a rollout needs a forward model"
-        values, first_step, simulated_steps = _rollout_values(
-            model, roots, candidates, agent, settings, noise, rng
-        )
+        return choose(policy_actions, candidates, values, None, 0)
+    assert model is not None, "a rollout needs a forward model"
+    rollouts = rollout_values(model, roots, candidates, agent, settings, noise, rng)
+    return choose(policy_actions, candidates, *rollouts)
 
+
+def propose(policy_actions: np.ndarray, noise: np.ndarray, include_policy_action: bool) -> np.ndarray:
+    """Generate candidate actions (Algorithm 1, step 1).
+
+    :param policy_actions: ``[n_envs, act_dim]``.
+    :param noise: ``[n_envs, beam, act_dim]``.
+    :param include_policy_action: whether the first candidate has no noise.
+    :return: ``[n_envs, beam, act_dim]`` in [-1, 1].
+    """
+    candidates = _clip(policy_actions[:, None] + noise)
+    if include_policy_action:
+        candidates[:, 0] = policy_actions
+    return candidates
+
+
+def choose(
+    policy_actions: np.ndarray,
+    candidates: np.ndarray,
+    values: np.ndarray,
+    first_step: FirstStep | None,
+    simulated_steps: int,
+) -> SearchResult:
+    """Select the best candidates (Algorithm 1, step 3).
+
+    :param policy_actions: ``[n_envs, act_dim]``, what is done where no candidate is valid.
+    :param candidates: ``[n_envs, beam, act_dim]``.
+    :param values: ``[n_envs, beam, sim]``, not finite where a simulation was invalid.
+    :param first_step: of every candidate, ``[n_envs * beam]``.
+    :param simulated_steps: how many.
+    """
     finite = np.isfinite(values)
     invalid_rollouts = int(values.size - np.count_nonzero(finite))
     means = values.mean(axis=2)
@@ -139,7 +177,7 @@ def beam_search(
     envs = np.arange(len(chosen))
     actions = candidates[envs, chosen]
     if first_step is not None:
-        first_step = _take_first_step(first_step, envs * settings.beam_width + chosen)
+        first_step = _take_first_step(first_step, envs * candidates.shape[1] + chosen)
     hopeless = ~np.isfinite(means[envs, chosen])
     if hopeless.any():
         actions[hopeless] = policy_actions[hopeless]
@@ -147,7 +185,7 @@ def beam_search(
     return SearchResult(actions, chosen, candidates, means, first_step, simulated_steps, invalid_rollouts)
 
 
-def _rollout_values(
+def rollout_values(
     model: ForwardModel,
     roots: Sequence[Any],
     candidates: np.ndarray,
@@ -155,16 +193,21 @@ def _rollout_values(
     settings: SearchSettings,
     noise: Noise,
     rng: np.random.Generator,
+    out_of_time: Callable[[], bool] = lambda: False,
 ) -> tuple[np.ndarray, FirstStep, int]:
-    """Evaluate ShortHorizon for every environment, candidate and simulation.
+    """Evaluate ShortHorizon for every environment, candidate and simulation (Algorithm 1, step 2).
 
     All rollouts advance together. The forward model holds one row for each of the ``unfinished``
     rollouts, in order, and then ``row_of`` is None; otherwise ``row_of`` says which row is whose:
     the simulations of a candidate share one in the first step of a deterministic environment, and
     rows of rollouts that ended are not yet dropped.
 
+    :param candidates: ``[n_envs, beam, act_dim]``.
+    :param noise: of ``beam`` candidates at least.
+    :param out_of_time: asked before every step; True gives up.
     :return: values ``[n_envs, beam, sim]`` in float64 (NaN where a simulation was invalid), the first step of
         every candidate ``[n_envs * beam]``, and the number of simulated steps.
+    :raises OutOfTimeError: if it gave up.
     """
     n_envs, beam, act_dim = candidates.shape
     depth_limit, n_sim = settings.rollout_depth, settings.n_simulations
@@ -183,6 +226,8 @@ def _rollout_values(
     model.set_roots(roots, np.repeat(np.arange(n_envs), beam * n_first), rng)
     actions = np.repeat(candidates.reshape(-1, act_dim), n_first, axis=0)
     for depth in range(depth_limit):
+        if out_of_time():
+            raise OutOfTimeError(simulated_steps)
         step = model.step(agent.unscale_action(actions))
         observations = step.observations
         simulated_steps += len(actions)

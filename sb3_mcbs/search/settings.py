@@ -36,6 +36,11 @@ class SearchSettings:
     :param matmul_precision: internal precision of the networks' float32 products during a search, as in
         ``torch.set_float32_matmul_precision``: ``"medium"`` is quicker on processors that multiply bfloat16.
         ``None``: as the process has it.
+    :param time_budget: seconds that a decision may take, from the call to the action. Candidates are then
+        evaluated in rounds while the next is expected to finish in time, and the results depend on how fast
+        the machine is. ``None``: all candidates, however long it takes, and reproducible to the bit.
+    :param max_beam_width: with ``time_budget``, the number of candidates that is enough; ``None``:
+        ``beam_width``, which may be left idle time.
     :raises TypeError: if a value has the wrong type.
     :raises ValueError: if a value is out of range.
     """
@@ -50,6 +55,8 @@ class SearchSettings:
     n_threads: int = 0
     forward_model: str = "auto"
     matmul_precision: str | None = None
+    time_budget: float | None = None
+    max_beam_width: int | None = None
 
     def __post_init__(self) -> None:
         _check_integer("beam_width", self.beam_width, 1, MAX_ROLLOUTS)
@@ -61,11 +68,11 @@ class SearchSettings:
                 f"beam_width * n_simulations is {self.beam_width * self.n_simulations} rollouts per "
                 f"environment; at most {MAX_ROLLOUTS} are supported."
             )
-        _check_noise("beam_noise", self.beam_noise)
+        _check_number("beam_noise", self.beam_noise)
         if self.rollout_noise is not None:
-            _check_noise("rollout_noise", self.rollout_noise)
+            _check_number("rollout_noise", self.rollout_noise)
         if self.noise_clip is not None:
-            _check_noise("noise_clip", self.noise_clip)
+            _check_number("noise_clip", self.noise_clip)
         if not isinstance(self.include_policy_action, bool):
             raise TypeError(
                 f"include_policy_action must be True or False, got {self.include_policy_action!r}."
@@ -76,6 +83,21 @@ class SearchSettings:
             raise ValueError(
                 f"matmul_precision must be one of {MATMUL_PRECISIONS} or None, got {self.matmul_precision!r}."
             )
+
+        self._check_budget()
+
+    def _check_budget(self) -> None:
+        if self.time_budget is not None:
+            _check_number("time_budget", self.time_budget)
+            if self.time_budget <= 0 or self.rollout_depth == 0:
+                raise ValueError(
+                    f"time_budget must be above 0 seconds, and needs a rollout_depth of 1 or more; got "
+                    f"{self.time_budget} with rollout_depth={self.rollout_depth}."
+                )
+        if self.max_beam_width is not None:
+            _check_integer("max_beam_width", self.max_beam_width, self.beam_width, MAX_ROLLOUTS)
+            if self.time_budget is None:
+                raise ValueError("max_beam_width needs a time_budget; without one set beam_width.")
 
     @property
     def effective_rollout_noise(self) -> float:
@@ -104,7 +126,7 @@ def _check_integer(name: str, value: Any, low: int, high: int) -> None:
         raise ValueError(f"{name} must be between {low} and {high}, got {value}.")
 
 
-def _check_noise(name: str, value: Any) -> None:
+def _check_number(name: str, value: Any) -> None:
     if isinstance(value, bool) or not isinstance(value, Real):
         raise TypeError(f"{name} must be a number, got {value!r}.")
     if not (math.isfinite(value) and float(value) >= 0):

@@ -1,0 +1,96 @@
+"""What the benchmarks share: the machine in words, fair timing, tables and files."""
+
+import json
+import os
+import platform
+import time
+from collections.abc import Callable, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+RESULTS = Path(__file__).parent / "results"
+NETWORKS = {"net_arch": [400, 300]}
+
+
+def machine() -> dict[str, str]:
+    """Describe where this runs."""
+    processor = platform.processor() or platform.machine()
+    if Path("/proc/cpuinfo").exists():
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        processor = next((line.split(":")[1].strip() for line in lines if "model name" in line), processor)
+    packages = ("torch", "mujoco", "gymnasium", "stable-baselines3", "numpy")
+    return {
+        "processor": processor,
+        "cores": str(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()),
+        "Python": platform.python_version(),
+        **{name: version(name) for name in packages},
+    }
+
+
+def alternate(
+    calls: dict[str, Callable[[], float]], seconds: float, least: int = 5, most: int = 500
+) -> dict[str, np.ndarray]:
+    """Run some calls in turn, so that all see the same disturbances.
+
+    :param calls: each returns the seconds that count.
+    :param seconds: how long to go on.
+    :param least: rounds that are done in any case.
+    :param most: rounds after which it is enough.
+    :return: the seconds of every round.
+    """
+    times: dict[str, list[float]] = {name: [] for name in calls}
+    for call in calls.values():
+        call()
+    end = time.perf_counter() + seconds
+    for number in range(most):
+        if number >= least and time.perf_counter() > end:
+            break
+        for name, call in calls.items():
+            times[name].append(call())
+    return {name: np.array(values) for name, values in times.items()}
+
+
+def timed(function: Callable[[], Any]) -> Callable[[], float]:
+    """Make a call return its own duration in seconds."""
+
+    def call() -> float:
+        start = time.perf_counter()
+        function()
+        return time.perf_counter() - start
+
+    return call
+
+
+def print_table(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+    """Print a Markdown table.
+
+    :param header: names of the columns.
+    :param rows: floats are shown with three significant digits.
+    """
+    print("| " + " | ".join(header) + " |")
+    print("|" + "---|" * len(header))
+    for row in rows:
+        print("| " + " | ".join(_shown(value) for value in row) + " |", flush=True)
+
+
+def _shown(value: Any) -> str:
+    if not isinstance(value, float):
+        return str(value)
+    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
+
+
+def write(name: str, results: Any) -> Path:
+    """Write results with the machine's description.
+
+    :param name: of the file, without its ending.
+    :param results: whatever JSON can hold.
+    :return: the file.
+    """
+    RESULTS.mkdir(exist_ok=True)
+    path = RESULTS / f"{name}.json"
+    path.write_text(json.dumps({"machine": machine(), "results": results}, indent=1) + "\n")
+    print(f"Written: {path}")
+    return path

@@ -1,0 +1,98 @@
+"""How the cost of a decision grows: ``make bench-scaling``.
+
+One of beam width, depth, simulations, environments and threads is varied at a time. The exponent is
+that of a power law fitted to the medians: 1 is linear, less is better.
+"""
+
+import argparse
+import functools
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib import pyplot
+from stable_baselines3.common.env_util import make_vec_env
+
+from benchmarks.common import NETWORKS, RESULTS, alternate, machine, print_table, timed, write
+from sb3_mcbs import MCBSTD3
+
+VARIED: dict[str, tuple[int, ...]] = {
+    "beam_width": (3, 6, 12, 24, 48),
+    "rollout_depth": (1, 2, 4, 8, 16),
+    "n_simulations": (1, 2, 5, 10, 20),
+    "n_envs": (1, 2, 4, 8),
+    "n_threads": (1, 2, 4),
+}
+BASE = {"beam_width": 6, "rollout_depth": 3, "n_simulations": 5, "n_envs": 1, "n_threads": 0}
+
+
+def searching(env_id: str, settings: dict[str, int]) -> MCBSTD3:
+    """An agent in the middle of an episode."""
+    search = {name: value for name, value in settings.items() if name != "n_envs"}
+    env = make_vec_env(env_id, settings["n_envs"], seed=0)
+    common: dict[str, Any] = {"policy_kwargs": NETWORKS, "seed": 0, "device": "cpu", "buffer_size": 1000}
+    agent = MCBSTD3("MlpPolicy", env, learning_starts=10**6, **common, **search)  # type: ignore[arg-type]
+    agent.learn(50 * settings["n_envs"])
+    return agent
+
+
+def measure(env_id: str, name: str, seconds: float) -> list[dict[str, Any]]:
+    """The cost for each value of one setting, all values in turn."""
+    agents = {value: searching(env_id, {**BASE, name: value}) for value in VARIED[name]}
+    rng = np.random.default_rng(0)
+
+    def decide(agent: Any) -> Any:
+        return agent._searcher.search(agent._last_obs, rng)
+
+    calls = {str(value): timed(functools.partial(decide, agent)) for value, agent in agents.items()}
+    times = alternate(calls, seconds, least=10)
+    results = []
+    for value, agent in agents.items():
+        steps = decide(agent).simulated_steps
+        milliseconds = 1e3 * float(np.median(times[str(value)]))
+        results.append(
+            {
+                "varied": name,
+                "value": value,
+                "simulated steps": steps,
+                "ms": milliseconds,
+                "us per simulated step": 1e3 * milliseconds / steps,
+            }
+        )
+    return results
+
+
+def exponent(results: list[dict[str, Any]]) -> float:
+    """The power law's, fitted to the logarithms."""
+    values = np.log([[r["value"], r["ms"]] for r in results])
+    return float(np.polyfit(values[:, 0], values[:, 1], 1)[0])
+
+
+def main() -> None:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--env", default="HalfCheetah-v5")
+    parser.add_argument("--seconds", type=float, default=12, help="for each setting")
+    args = parser.parse_args()
+    matplotlib.use("agg")
+    print(machine())
+    figure, all_axes = pyplot.subplots(1, len(VARIED), figsize=(15, 3.2))
+    results: list[dict[str, Any]] = []
+    for axes, name in zip(all_axes, VARIED, strict=True):
+        found = measure(args.env, name, args.seconds)
+        fitted = exponent(found)
+        results += [{**result, "exponent": fitted} for result in found]
+        axes.loglog([r["value"] for r in found], [r["ms"] for r in found], "o-")
+        axes.set_title(f"exponent {fitted:.2f}", fontsize=9)
+        axes.set_xlabel(name)
+    all_axes[0].set_ylabel("ms per decision")
+    figure.suptitle(f"{args.env}, varied around (6, 3, 5)", fontsize=10)
+    figure.tight_layout()
+    RESULTS.mkdir(exist_ok=True)
+    figure.savefig(RESULTS / "scaling.png", dpi=120)
+    print_table(list(results[0]), [list(result.values()) for result in results])
+    write("scaling", results)
+
+
+if __name__ == "__main__":
+    main()

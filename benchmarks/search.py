@@ -1,0 +1,224 @@
+"""What one decision costs: ``make bench-search``.
+
+A decision is held against the floor of its own physics (its states and controls replayed through
+``mujoco.batch``, nothing else), the floor of its own networks (the same matrix products with the
+same weights through ``torch.mm``, nothing else), and the usual way of searching (``naive.py``).
+"""
+
+import argparse
+import time
+from typing import Any
+
+import gymnasium as gym
+import matplotlib
+import mujoco
+import numpy as np
+import torch as th
+from matplotlib import pyplot
+from mujoco.batch import Batch
+
+from benchmarks.common import NETWORKS, RESULTS, alternate, machine, print_table, timed, write
+from benchmarks.naive import usual_search
+from sb3_mcbs import MCBSTD3
+
+ENVS = ("HalfCheetah-v5", "Walker2d-v5", "Swimmer-v5", "Ant-v5", "Humanoid-v5")
+SIZES = ((6, 1, 5), (6, 3, 5), (18, 6, 5), (18, 9, 10))
+
+
+class Decision:
+    """An agent in the middle of an episode, and everything that its search did once.
+
+    :param env_id: the environment.
+    :param size: beam width, rollout depth, simulations per candidate.
+    """
+
+    def __init__(self, env_id: str, size: tuple[int, int, int]) -> None:
+        beam_width, rollout_depth, n_simulations = size
+        self.size = size
+        self.agent = MCBSTD3(
+            "MlpPolicy",
+            env_id,
+            learning_starts=300,
+            buffer_size=2000,
+            batch_size=256,
+            policy_kwargs=NETWORKS,
+            seed=0,
+            device="cpu",
+            beam_width=beam_width,
+            rollout_depth=rollout_depth,
+            n_simulations=n_simulations,
+        )
+        self.agent.learn(310)
+        searcher = self.agent._searcher
+        assert searcher is not None and self.agent.env is not None
+        self.searcher, self.model = searcher, searcher.model
+        self.real: Any = self.agent.env.get_attr("unwrapped")[0]
+        self.simulator = gym.make(env_id)
+        self.simulator.reset()
+        self.rng = np.random.default_rng(0)
+        self._record()
+
+    def search(self) -> None:
+        """One decision from the present state, which stays as it is."""
+        observations: Any = self.agent._last_obs
+        self.searcher.search(observations, self.rng)
+
+    def search_the_usual_way(self) -> None:
+        """The same by :mod:`naive`."""
+        observations: Any = self.agent._last_obs
+        usual_search(self.agent, self.real, self.simulator, observations[0], self.size, 0.1, self.rng)
+
+    def _record(self) -> None:
+        """Note the states before every physics step, and the rows of every network call."""
+        self.search()  # so that the engine has its size
+        engine: Any = self.model._engine  # type: ignore[union-attr]
+        functions, step = self.searcher._functions, engine.step
+        self.states: list[np.ndarray] = []
+        policy_rows, value_rows = [], []
+
+        def noted_step(rows: int, n_substeps: int) -> Any:
+            self.states.append(engine.state[:rows].copy())
+            return step(rows, n_substeps)
+
+        def noted_policy(observations: Any) -> np.ndarray:
+            policy_rows.append(len(observations))
+            return functions.policy(observations)
+
+        def noted_value(observations: Any, actions: np.ndarray) -> np.ndarray:
+            value_rows.append(len(observations))
+            return functions.value(observations, actions)
+
+        engine.step = noted_step
+        self.searcher._functions = functions._replace(policy=noted_policy, value=noted_value)
+        self.search()
+        engine.step = step
+        self.searcher._functions = functions
+
+        self.simulated_steps = sum(len(states) for states in self.states)
+        self.n_substeps = self.real.frame_skip
+        most = max(len(states) for states in self.states)
+        self.batch = Batch(self.real.model, most, 0)
+        self.ids = np.arange(most, dtype=np.int32)
+        critics: list[Any] = self.agent.critic.q_networks
+        calls = [(self.agent.actor.mu, n) for n in policy_rows]
+        calls += [(critic, n) for n in value_rows for critic in critics]
+        linear = th.nn.Linear
+        weights = [
+            (layer.weight.detach(), n) for net, n in calls for layer in net if isinstance(layer, linear)
+        ]
+        # Both orders of storage: the quicker one is the floor.
+        self.products = (
+            [(th.randn(n, w.shape[1]), w.t(), th.empty(n, w.shape[0])) for w, n in weights],
+            [(w, th.randn(w.shape[1], n), th.empty(w.shape[0], n)) for w, n in weights],
+        )
+
+    def physics_floor(self) -> float:
+        """Seconds that the batch alone needs for the decision's steps."""
+        total = 0.0
+        for states in self.states:
+            self.batch.state[: len(states)] = states
+            start = time.perf_counter()
+            self.batch.step(self.ids[: len(states)], self.n_substeps)
+            total += time.perf_counter() - start
+        return total
+
+    def network_floor(self, order: int) -> float:
+        """Seconds of the decision's matrix products, on one thread like the search's."""
+        n_threads = th.get_num_threads()
+        th.set_num_threads(1)
+        start = time.perf_counter()
+        for left, right, out in self.products[order]:
+            th.mm(left, right, out=out)
+        seconds = time.perf_counter() - start
+        th.set_num_threads(n_threads)
+        return seconds
+
+    def search_after_gradient_step(self) -> float:
+        """Seconds of a decision that follows a gradient step, as in training."""
+        self.agent.train(gradient_steps=1, batch_size=256)
+        return timed(self.search)()
+
+
+def measure(env_id: str, size: tuple[int, int, int], seconds: float) -> dict[str, Any]:
+    """All figures of one environment and size, times in milliseconds.
+
+    :param env_id: the environment.
+    :param size: beam width, rollout depth, simulations per candidate.
+    :param seconds: how long to measure.
+    """
+    decision = Decision(env_id, size)
+    calls = {
+        "physics": decision.physics_floor,
+        "networks by rows": lambda: decision.network_floor(0),
+        "networks by columns": lambda: decision.network_floor(1),
+        "search": timed(decision.search),
+    }
+    times = alternate(calls, seconds, least=15)
+    usual = alternate({"usual": timed(decision.search_the_usual_way)}, seconds / 3, least=2)["usual"]
+    training = alternate({"search": decision.search_after_gradient_step}, seconds, least=15)["search"]
+    median = {name: 1e3 * float(np.median(values)) for name, values in times.items()}
+    physics, networks = median["physics"], min(median["networks by rows"], median["networks by columns"])
+    # Of each round by itself, then the median: the machine's speed drifts less within a round.
+    floors = times["physics"] + np.minimum(times["networks by rows"], times["networks by columns"])
+    control_period = 1e3 * decision.real.dt
+    return {
+        "env": env_id,
+        "size": size,
+        "rounds": len(times["search"]),
+        "simulated steps": decision.simulated_steps,
+        "ms": median["search"],
+        "p99 ms": 1e3 * float(np.percentile(times["search"], 99)),
+        "physics floor ms": physics,
+        "network floor ms": networks,
+        "ms / floors": float(np.median(times["search"] / floors)),
+        "usual way ms": 1e3 * float(np.median(usual)),
+        "usual way / ours": 1e3 * float(np.median(usual)) / median["search"],
+        "control period ms": control_period,
+        "share of period": median["search"] / control_period,
+        "p99 ms while training": 1e3 * float(np.percentile(training, 99)),
+    }
+
+
+def draw(results: list[dict[str, Any]]) -> None:
+    """One group of bars per environment and size: floors, ours, the usual way."""
+    figure, axes = pyplot.subplots(figsize=(10, 4.5))
+    places = np.arange(len(results))
+    labels = [f"{r['env'].split('-')[0]}\n{','.join(map(str, r['size']))}" for r in results]
+    physics = np.array([r["physics floor ms"] for r in results])
+    axes.bar(places - 0.27, physics, 0.25, label="physics floor")
+    axes.bar(
+        places - 0.27, [r["network floor ms"] for r in results], 0.25, bottom=physics, label="network floor"
+    )
+    axes.bar(places, [r["ms"] for r in results], 0.25, label="sb3-mcbs")
+    axes.bar(places + 0.27, [r["usual way ms"] for r in results], 0.25, label="the usual way")
+    axes.set_yscale("log")
+    axes.set_ylabel("ms per decision")
+    axes.set_xticks(places, labels, fontsize=6)
+    axes.legend()
+    figure.tight_layout()
+    figure.savefig(RESULTS / "search.png", dpi=120)
+
+
+def main() -> None:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--env", nargs="+", default=ENVS)
+    parser.add_argument("--size", nargs="+", default=[",".join(map(str, size)) for size in SIZES])
+    parser.add_argument("--seconds", type=float, default=4, help="for each environment and size")
+    args = parser.parse_args()
+    matplotlib.use("agg")
+    print(machine())
+    results = []
+    for env_id in args.env:
+        for size in args.size:
+            beam_width, depth, n_simulations = map(int, size.split(","))
+            results.append(measure(env_id, (beam_width, depth, n_simulations), args.seconds))
+            print(env_id, size, f"{results[-1]['ms']:.2f} ms", flush=True)
+    print_table(list(results[0]), [list(result.values()) for result in results])
+    write("search", results)
+    draw(results)
+
+
+if __name__ == "__main__":
+    mujoco.set_mju_user_warning(lambda message: None)
+    main()
