@@ -58,12 +58,13 @@ def decide(world, pace, budget, seed=0, n_envs=1, **changes):
 def test_rounds_are_added_while_there_is_time():
     clock = Clock()
     world, pace = SlowWorld(clock), Pace(clock)
-    counts = [decide(world, pace, budget).values.shape[1] for budget in (0.5, 3.5, 7.5, 100.0)]
-    # The first decision does not know yet that a candidate takes a second, and is given up in its only step.
-    assert counts[0] == 1
-    assert 2 <= counts[1] <= 3
-    assert 5 <= counts[2] <= 7
-    assert counts[3] == 8, "beam_width is enough"
+    assert decide(world, pace, 0.5).rounds == 1, "the first decision knows nothing yet, and is late"
+    for _ in range(100):
+        decide(world, pace, 5.0)
+    for budget, most in ((0.5, 0), (1.5, 1), (3.5, 3), (7.5, 7), (100.0, 8)):
+        start = clock.now
+        assert decide(world, pace, budget).values.shape[1] == most
+        assert clock.now - start <= budget
 
 
 def test_the_best_of_all_rounds_is_chosen_and_matches_one_beam():
@@ -99,14 +100,23 @@ def test_unfinished_rounds_do_not_count():
     assert result.rounds == 0 and result.chosen[0] == -1 and result.first_step is None
     assert result.actions[0] == 0.0, "the policy's own action"
     assert result.simulated_steps == world.steps_taken == 2, "given up at the first step after the deadline"
+    # Once the steps are known, one that would end after the deadline is not begun.
+    for number in range(60):
+        start = clock.now
+        assert decide(world, pace, 1.5, rollout_depth=5).rounds == 0
+        assert clock.now - start <= 1.5 or number < 15
+    assert decide(world, pace, 5.5, rollout_depth=5).rounds == 1
 
 
-def test_without_time_the_policy_acts_and_one_hiccup_is_forgotten():
+def test_one_hiccup_does_not_end_searching():
     clock = Clock()
     world, pace = SlowWorld(clock, seconds_per_row=0.1), Pace(clock)
-    pace.note_round(1, 1000.0)
-    assert decide(world, pace, 1.0).rounds == 0 and world.steps_taken == 0
-    assert decide(world, pace, 1.0).rounds > 0
+    decide(world, pace, 1.0)
+    world.seconds_per_row = 10.0
+    assert decide(world, pace, 1.0).rounds == 0 or clock.now > 10
+    world.seconds_per_row = 0.1
+    results = [decide(world, pace, 1.0) for _ in range(400)]
+    assert all(result.rounds > 0 for result in results[-100:])
 
 
 def test_more_candidates_than_the_beam_if_wanted():
@@ -128,13 +138,13 @@ def test_the_policys_action_is_among_the_candidates_once():
 
 def test_wide_rounds_leave_half_of_the_time():
     pace = Pace(Clock())
-    for width in (1, 2, 4, 8):
+    for width in 10 * (1, 2, 4, 8):
         pace.note_round(width, float(width))
     assert pace.affordable(7.0, 100) == 2
     assert pace.affordable(1.5, 100) == 1
     assert pace.affordable(0.5, 100) == 0
     assert pace.affordable(1000.0, 5) == 5
-    pace.note_ending(1.0)
+    pace.ending.note(1.0)
     assert pace.affordable(1.5, 100) == 0
 
 

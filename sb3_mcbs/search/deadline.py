@@ -21,8 +21,35 @@ from sb3_mcbs.search.beam import (
 )
 from sb3_mcbs.search.settings import SearchSettings
 
-#: How many past rounds a forecast looks at, and which share of them it covers.
-_MEMORY, _SHARE = 64, 0.9
+#: How many past durations a forecast looks at, and which share of them it covers: of rounds, and of single
+#: steps, which are what makes a decision late.
+_MEMORY, _SHARE_OF_ROUNDS, _SHARE_OF_STEPS = 64, 0.75, 0.95
+#: So many durations must be known before anything is refused because of them: the first ones are slow.
+_WARM_UP = 10
+#: Factors of a forecast each time that something was not done because of it: the machine may be quicker now.
+_RELAX_ROUND, _RELAX_STEP = 0.99, 0.98
+
+
+class _Durations:
+    """The last durations of something that is done again and again."""
+
+    def __init__(self) -> None:
+        self._last: deque[float] = deque(maxlen=_MEMORY)
+
+    def note(self, seconds: float) -> None:
+        self._last.append(seconds)
+
+    def relax(self, factor: float) -> None:
+        """Make the forecast less strict: what is not done any more cannot be learned again."""
+        self._last = deque((factor * seconds for seconds in self._last), maxlen=_MEMORY)
+
+    def forecast(self, share: float) -> float:
+        """What that share of the durations did not exceed; 0 if there are none yet."""
+        return sorted(self._last)[int(share * (len(self._last) - 1) + 0.5)] if self._last else 0.0
+
+    def known(self) -> bool:
+        """Whether there are enough to refuse something because of them."""
+        return len(self._last) >= _WARM_UP
 
 
 class Pace:
@@ -33,47 +60,36 @@ class Pace:
 
     def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
         self.clock = clock
-        self._rounds: dict[int, deque[float]] = {}
-        self._ending: deque[float] = deque(maxlen=_MEMORY)
+        self._rounds: dict[int, _Durations] = {}
+        self._steps: dict[tuple[int, int], _Durations] = {}
+        self.ending = _Durations()
 
     def note_round(self, width: int, seconds: float) -> None:
         """Learn from a round.
 
         :param width: its candidates.
-        :param seconds: what it took, or what had passed when it was given up.
+        :param seconds: what it took, or would have taken at least if it had not been given up.
         """
-        self._rounds.setdefault(width, deque(maxlen=_MEMORY)).append(seconds)
+        self._rounds.setdefault(width, _Durations()).note(seconds)
 
-    def note_no_round(self) -> None:
-        """Forget the oldest single-candidate round, so that one hiccup does not end all searching."""
-        if self._rounds.get(1):
-            self._rounds[1].popleft()
-        if not self._rounds.get(1):
-            self._rounds.clear()
+    def of_step(self, width: int, depth: int) -> _Durations:
+        """The durations of one step of rounds."""
+        return self._steps.setdefault((width, depth), _Durations())
 
-    def note_ending(self, seconds: float) -> None:
-        """Learn what it takes to choose after the last round."""
-        self._ending.append(seconds)
-
-    @property
-    def ending(self) -> float:
-        """Seconds to reserve for choosing."""
-        return _high(self._ending) if self._ending else 0.0
-
-    def forecast(self, width: int) -> float | None:
+    def of_round(self, width: int) -> float | None:
         """Seconds that a round will probably not exceed.
 
         :param width: its candidates.
         :return: ``None`` if no round was done yet.
         """
         if width in self._rounds:
-            return _high(self._rounds[width])
+            return self._rounds[width].forecast(_SHARE_OF_ROUNDS)
         if not self._rounds:
             return None
         # A round has fixed costs, so that n times the candidates take less than n times as long.
         narrower = [known for known in self._rounds if known < width]
         nearest = max(narrower) if narrower else min(self._rounds)
-        return _high(self._rounds[nearest]) * max(1.0, width / nearest)
+        return self._rounds[nearest].forecast(_SHARE_OF_ROUNDS) * max(1.0, width / nearest)
 
     def affordable(self, seconds: float, most: int) -> int:
         """The number of candidates for the next round.
@@ -84,22 +100,58 @@ class Pace:
         :param most: candidates that are still wanted.
         :return: a power of two or ``most``; 0 if not even one candidate is expected to finish.
         """
-        seconds -= self.ending
-        one = self.forecast(1)
-        if seconds <= 0 or (one is not None and one > seconds):
+        seconds -= self.ending.forecast(_SHARE_OF_STEPS)
+        if seconds <= 0:
+            return 0
+        single = self._rounds.get(1)
+        if single is not None and single.known() and single.forecast(_SHARE_OF_ROUNDS) > seconds:
+            single.relax(_RELAX_ROUND)
             return 0
         width = 1
         while width < most:
             wider = min(2 * width, most)
-            expected = self.forecast(wider)
+            expected = self.of_round(wider)
             if expected is None or expected > seconds / 2:
                 break
             width = wider
-        return min(width, most)
+        return width
 
 
-def _high(durations: Sequence[float]) -> float:
-    return sorted(durations)[int(_SHARE * (len(durations) - 1) + 0.5)]
+class _Watch:
+    """Asked before every step of a round whether to give up; learns how long the steps take."""
+
+    def __init__(self, pace: Pace, width: int, deadline: float) -> None:
+        self._pace, self._width, self._deadline = pace, width, deadline
+        self._start = self._step_start = pace.clock()
+        self._depth = -1
+        self.expected = 0.0
+
+    def __call__(self) -> bool:
+        now = self._pace.clock()
+        self._note_step(now)
+        self._depth += 1
+        self._step_start = now
+        steps = self._pace.of_step(self._width, self._depth)
+        step = steps.forecast(_SHARE_OF_STEPS)
+        self.expected = now - self._start + step
+        if not steps.known():
+            return now > self._deadline
+        return now + step + self._pace.ending.forecast(_SHARE_OF_STEPS) > self._deadline
+
+    def finish(self) -> None:
+        """The round is finished."""
+        now = self._pace.clock()
+        self._note_step(now)
+        self._pace.note_round(self._width, now - self._start)
+
+    def give_up(self) -> None:
+        """The round was given up."""
+        self._pace.note_round(self._width, self.expected)
+        self._pace.of_step(self._width, self._depth).relax(_RELAX_STEP)
+
+    def _note_step(self, now: float) -> None:
+        if self._depth >= 0:
+            self._pace.of_step(self._width, self._depth).note(now - self._step_start)
 
 
 def deadline_search(
@@ -135,21 +187,21 @@ def deadline_search(
     first_steps: list[FirstStep] = []
     simulated_steps = done = 0
     while done < enough:
-        start = pace.clock()
-        width = pace.affordable(deadline - start, enough - done)
+        width = pace.affordable(deadline - pace.clock(), enough - done)
         if width == 0:
             break
+        watch = _Watch(pace, width, deadline)
         noise = draw_noise(rng, replace(settings, beam_width=width, max_beam_width=None), n_envs, act_dim)
         proposed = propose(policy_actions, noise.beam, settings.include_policy_action and done == 0)
         try:
             round_values, first_step, steps = rollout_values(
-                model, roots, proposed, agent, settings, noise, rng, lambda: pace.clock() > deadline
+                model, roots, proposed, agent, settings, noise, rng, out_of_time=watch
             )
         except OutOfTimeError as reason:
             simulated_steps += reason.simulated_steps
-            pace.note_round(width, pace.clock() - start)
+            watch.give_up()
             break
-        pace.note_round(width, pace.clock() - start)
+        watch.finish()
         candidates.append(proposed)
         values.append(round_values)
         first_steps.append(first_step)
@@ -158,7 +210,6 @@ def deadline_search(
 
     start = pace.clock()
     if not done:
-        pace.note_no_round()
         return _policy_alone(policy_actions, simulated_steps)
     merged = choose(
         policy_actions,
@@ -167,7 +218,7 @@ def deadline_search(
         _merge(first_steps, n_envs),
         simulated_steps,
     )
-    pace.note_ending(pace.clock() - start)
+    pace.ending.note(pace.clock() - start)
     return merged._replace(rounds=len(candidates))
 
 
