@@ -102,7 +102,13 @@ def _columns(first: np.ndarray, second: np.ndarray | None, device: th.device) ->
         columns = np.empty((len(first) + second.shape[1], len(second)), dtype=np.float32)
         columns[: len(first)] = first
         columns[len(first) :] = second.T
-    return th.from_numpy(columns).to(device)
+    tensor = th.from_numpy(columns)
+    # ``to`` and ``cpu`` cost as much as a layer even where they have nothing to do.
+    return tensor if device.type == "cpu" else tensor.to(device)
+
+
+def _to_numpy(tensor: th.Tensor, device: th.device) -> np.ndarray:
+    return (tensor if device.type == "cpu" else tensor.cpu()).numpy()
 
 
 def policy_function(agent: OffPolicyAlgorithm) -> Callable[[Observations], np.ndarray]:
@@ -123,7 +129,7 @@ def policy_function(agent: OffPolicyAlgorithm) -> Callable[[Observations], np.nd
             known, mlp = actor, _or_none(actor_mlp, actor)
         if mlp is not None:
             assert isinstance(observations, np.ndarray)
-            return mlp(_columns(observations, None, agent.device)).cpu().numpy().T
+            return _to_numpy(mlp(_columns(observations, None, agent.device)), agent.device).T
         with th.no_grad():
             tensor = obs_as_tensor(observations, agent.device)
             actions = actor(tensor, deterministic=True) if stochastic else actor(tensor)
@@ -153,8 +159,8 @@ def value_function(agent: OffPolicyAlgorithm) -> Callable[[Observations, np.ndar
             inputs = _columns(observations, actions, agent.device)
             columns = [mlp(inputs) for mlp in mlps]
             if quantiles:
-                return th.cat(columns).mean(dim=0).cpu().numpy()
-            return functools.reduce(th.minimum, columns)[0].cpu().numpy()
+                return _to_numpy(th.cat(columns).mean(dim=0), agent.device)
+            return _to_numpy(functools.reduce(th.minimum, columns)[0], agent.device)
         with th.no_grad():
             tensor = obs_as_tensor(observations, agent.device)
             estimates = critic(tensor, th.as_tensor(actions, device=agent.device))

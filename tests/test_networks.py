@@ -1,0 +1,152 @@
+"""Networks as functions on arrays, against SB3's own calls of them."""
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from sb3_contrib import TQC
+from stable_baselines3 import DDPG, SAC, TD3
+from stable_baselines3.common.env_util import make_vec_env
+
+from sb3_mcbs import MCBSTD3
+from sb3_mcbs.algorithms import networks
+from sb3_mcbs.algorithms.mlp import MLP
+from sb3_mcbs.algorithms.networks import policy_function, value_function
+from sb3_mcbs.algorithms.torch_settings import matmul_precision, one_thread
+from tests.conftest import SMALL
+
+
+def agent_of(cls, **policy_kwargs):
+    return cls(
+        "MlpPolicy",
+        "HalfCheetah-v5",
+        seed=0,
+        **{**SMALL, "policy_kwargs": dict(net_arch=[16, 12]) | policy_kwargs},
+    )
+
+
+def sb3_action(agent, observations):
+    return agent.policy.scale_action(agent.predict(observations, deterministic=True)[0])
+
+
+def sb3_value(agent, observations, actions):
+    with th.no_grad():
+        values = agent.critic(th.as_tensor(observations), th.as_tensor(actions))
+        if isinstance(agent, TQC):
+            return values.mean(dim=(1, 2)).numpy()
+        return np.min([value[:, 0].numpy() for value in values], axis=0)
+
+
+KINDS = [
+    (TD3, {}),
+    (TD3, dict(n_critics=3, activation_fn=th.nn.Tanh)),
+    (TD3, dict(activation_fn=th.nn.ELU)),  # not covered by MLP: SB3's own call
+    (DDPG, {}),
+    (SAC, {}),
+    (SAC, dict(use_sde=True)),
+    (TQC, {}),
+]
+
+
+@pytest.mark.parametrize("cls, policy_kwargs", KINDS)
+@pytest.mark.parametrize("rows", [1, 7])
+def test_same_numbers_as_sb3(cls, policy_kwargs, rows):
+    agent = agent_of(cls, **policy_kwargs)
+    rng = np.random.default_rng(0)
+    observations, actions = rng.standard_normal((rows, 17)), rng.uniform(-1, 1, (rows, 6)).astype(np.float32)
+    found = policy_function(agent)(observations)
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found, sb3_action(agent, observations), rtol=1e-5, atol=1e-6)
+    found = value_function(agent)(observations, actions)
+    np.testing.assert_allclose(found, sb3_value(agent, observations, actions), rtol=1e-5, atol=1e-6)
+
+
+def test_present_parameters_and_networks_are_used():
+    agent, other = agent_of(TD3), agent_of(TD3, activation_fn=th.nn.Tanh)
+    observations = np.random.default_rng(0).standard_normal((3, 17))
+    policy = policy_function(agent)
+    policy(observations)
+    with th.no_grad():
+        agent.actor.mu[0].weight.mul_(2)  # as an optimizer does
+        agent.actor.mu[2].weight.data = agent.actor.mu[2].weight.data * 3  # as ``to(device)`` does
+    np.testing.assert_allclose(policy(observations), sb3_action(agent, observations), rtol=1e-5, atol=1e-6)
+    agent.policy.actor = other.actor
+    np.testing.assert_allclose(policy(observations), sb3_action(other, observations), rtol=1e-5, atol=1e-6)
+
+
+def test_hooks_run(monkeypatch):
+    agent = agent_of(TD3)
+    agent.actor.mu[1].register_forward_hook(lambda module, inputs, output: output * 0)
+    bias = agent.actor.mu[2].bias
+    expected = policy_function(agent)(np.ones((2, 17)))
+    np.testing.assert_allclose(expected, sb3_action(agent, np.ones((2, 17))), rtol=1e-5, atol=1e-6)
+    assert bias.requires_grad
+    with pytest.raises(TypeError, match="hooks"):
+        networks.actor_mlp(agent.actor)
+
+
+def test_images_are_not_flattened():
+    agent = agent_of(TD3)
+    agent.actor.observation_space = spaces.Box(0, 255, (3, 40, 40), np.uint8)
+    with pytest.raises(TypeError, match="vectors"):
+        networks.actor_mlp(agent.actor)
+
+
+def test_other_layers_are_named():
+    with pytest.raises(TypeError, match="LayerNorm"):
+        MLP(th.nn.Linear(2, 2), th.nn.LayerNorm(2))
+
+
+def test_gradients_against_autograd():
+    th.manual_seed(0)
+    network = th.nn.Sequential(
+        th.nn.Linear(4, 8), th.nn.ReLU(), th.nn.Linear(8, 6, bias=False), th.nn.Tanh(), th.nn.Linear(6, 2)
+    )
+    rows = th.randn(5, 4, requires_grad=True)
+    weight = th.randn(5, 2)
+    (network(rows) * weight).sum().backward()
+    expected = [p.grad.clone() for p in network.parameters()]
+    mlp, x = MLP(network), rows.detach().t().contiguous()
+    outputs = mlp.outputs(x)
+    by_input = mlp.backward(x, outputs, weight.t().contiguous(), of_parameters=False)
+    np.testing.assert_allclose(by_input.t(), rows.grad, rtol=1e-5, atol=1e-6)
+    for parameter in network.parameters():
+        parameter.grad = None
+    mlp.backward(x, mlp.outputs(x), weight.t().contiguous(), of_parameters=True)
+    for parameter, gradient in zip(network.parameters(), expected, strict=True):
+        np.testing.assert_allclose(parameter.grad, gradient, rtol=1e-5, atol=1e-6)
+
+
+def test_process_wide_settings_are_put_back():
+    before = th.get_float32_matmul_precision()
+    th.set_num_threads(2)
+    try:
+        with pytest.raises(ZeroDivisionError), one_thread(), matmul_precision("medium"):
+            assert th.get_num_threads() == 1 and th.get_float32_matmul_precision() == "medium"
+            1 / 0  # noqa: B018
+        assert th.get_num_threads() == 2 and th.get_float32_matmul_precision() == before
+        # Threads that were released come back.
+        with one_thread():
+            pass
+        product = th.randn(300, 300) @ th.eye(300)
+        assert product.shape == (300, 300)
+    finally:
+        th.set_num_threads(1)
+
+
+def test_the_update_that_is_used(capsys):
+    fast = MCBSTD3("MlpPolicy", "Pendulum-v1", verbose=1, **SMALL)
+    assert fast._update is not None
+    own = MCBSTD3("MlpPolicy", "Pendulum-v1", fast_update=False, **SMALL)
+    assert own._update is None
+    capsys.readouterr()
+    settings = {**SMALL, "policy_kwargs": dict(net_arch=[8], activation_fn=th.nn.ELU)}
+    other = MCBSTD3("MlpPolicy", make_vec_env("Pendulum-v1"), verbose=1, learning_starts=10, **settings)
+    assert other._update is None
+    assert "SB3's own" in capsys.readouterr().out
+    other.learn(15)
+    assert other._n_updates == 5
+    with pytest.raises(TypeError, match="fast_update"):
+        MCBSTD3("MlpPolicy", "Pendulum-v1", fast_update="yes", **SMALL)
+    with pytest.raises(ValueError, match="matmul_precision"):
+        MCBSTD3("MlpPolicy", "Pendulum-v1", matmul_precision="low", **SMALL)
