@@ -63,11 +63,13 @@ def make_agent(arm: str, env_id: str, n_envs: int) -> Any:
         from benchmarks.naive import UsualMCBSTD3
 
         return UsualMCBSTD3("MlpPolicy", env, **common)
-    beam_width, rollout_depth, n_simulations = SIZES[arm]
+    size, _, precision = arm.partition(", ")
+    beam_width, rollout_depth, n_simulations = SIZES[size]
     return MCBSTD3(
         "MlpPolicy",
         env,
         **common,
+        matmul_precision=precision or None,
         beam_width=beam_width,
         rollout_depth=rollout_depth,
         n_simulations=n_simulations,

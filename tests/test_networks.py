@@ -150,3 +150,15 @@ def test_the_update_that_is_used(capsys):
         MCBSTD3("MlpPolicy", "Pendulum-v1", fast_update="yes", **SMALL)
     with pytest.raises(ValueError, match="matmul_precision"):
         MCBSTD3("MlpPolicy", "Pendulum-v1", matmul_precision="low", **SMALL)
+
+
+@pytest.mark.parametrize("low, high", [(-1.0, 1.0), (-2.0, 2.0), (-0.4, 0.4), (-0.3, 7.1), (0.0, 1e-3)])
+def test_actions_are_unscaled_as_sb3_does_it_to_the_bit(low, high):
+    import gymnasium as gym
+
+    env = gym.wrappers.RescaleAction(gym.make("Pendulum-v1"), np.float32(low), np.float32(high))
+    agent = MCBSTD3("MlpPolicy", env, **SMALL)
+    actions = np.random.default_rng(0).uniform(-1, 1, (5000, 1)).astype(np.float32)
+    found = agent._searcher.unscale(actions)
+    assert found.dtype == np.float32
+    np.testing.assert_array_equal(found, agent.policy.unscale_action(actions))

@@ -21,12 +21,12 @@ def trained_pair(steps=200, env=None, **kwargs):
             make_vec_env("HalfCheetah-v5", 1, seed=0) if env is None else env(),
             seed=3,
             device="cpu",
-            buffer_size=2000,
-            learning_starts=600,
+            buffer_size=1000,
+            learning_starts=300,
             batch_size=64,
             **{"policy_kwargs": dict(net_arch=[64, 48])} | kwargs,
         )
-        agent.learn(600)
+        agent.learn(300)
         agents.append(agent)
     theirs, ours = agents
     update = TD3Update(ours)
@@ -85,5 +85,5 @@ def test_the_optimizer_goes_on_with_sb3s_own_update(tmp_path):
     loaded = TD3.load(tmp_path / "agent", env, device="cpu")
     state = next(iter(loaded.critic.optimizer.state.values()))
     assert float(state["step"]) == 8
-    loaded.learn(700, reset_num_timesteps=True)
+    loaded.learn(400, reset_num_timesteps=True)
     assert loaded._n_updates > 8

@@ -301,9 +301,8 @@ class MCBSTD3(TD3):
         self.n_decisions += n_envs
         self.n_simulated_steps += result.simulated_steps
         self.n_invalid_rollouts += result.invalid_rollouts
-        valid = result.chosen >= 0
-        if valid.any() and np.isfinite(result.values[valid]).all():
-            values = result.values[valid]
+        values = result.values[result.chosen >= 0]
+        if values.size and np.isfinite(values).all():
             self.logger.record_mean(
                 "search/value_gain", float((values.max(axis=1) - values.mean(axis=1)).mean())
             )

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -52,6 +53,9 @@ class Searcher:
         self.settings = settings
         self._action_shape = agent.action_space.shape or ()
         self._act_dim = get_action_dim(agent.action_space)
+        space: Any = agent.action_space
+        known = type(agent.policy).unscale_action is BasePolicy.unscale_action and space.dtype == np.float32
+        self._low, self._half_range = space.low, 0.5 * (space.high - space.low) if known else None
         self.model: ForwardModel | None = None
         self._previous_step_differed = False
         self._pace = Pace()
@@ -158,7 +162,14 @@ class Searcher:
         :param actions: ``[rows, act_dim]`` in [-1, 1].
         :return: ``[rows, *act_shape]``.
         """
-        return self.agent.policy.unscale_action(actions.reshape(-1, *self._action_shape))
+        actions = actions.reshape(-1, *self._action_shape)
+        if self._half_range is None:
+            return self.agent.policy.unscale_action(actions)
+        # SB3's formula, low + 0.5 * (action + 1) * (high - low), to the bit: halving rounds nothing.
+        unscaled = actions + 1.0
+        unscaled *= self._half_range
+        unscaled += self._low
+        return unscaled
 
     def _present_observations(self, observations: Observations) -> Observations:
         """The environments' own observations, checked against those that the agent was given."""

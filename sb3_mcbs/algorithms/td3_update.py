@@ -39,6 +39,10 @@ class TD3Update:
         self._critics, self._critic_targets = critic_mlps(agent.critic), critic_mlps(agent.critic_target)
         for network in (agent.actor, agent.critic):
             _check_optimizer(network)
+        self._targets_and_networks: list[tuple[list[th.Tensor], list[th.Tensor]]] = [
+            (list(target.parameters()), list(network.parameters()))
+            for target, network in ((agent.critic_target, agent.critic), (agent.actor_target, agent.actor))
+        ]
 
     def _present_networks(self) -> list[nn.Module]:
         agent = self._agent
@@ -53,7 +57,7 @@ class TD3Update:
         agent = self._agent
         if self._present_networks() != self._networks:
             self._take_networks()
-        agent.policy.set_training_mode(True)
+        # No layer here does anything else in training mode, so the mode stays as it is.
         agent._update_learning_rate([agent.actor.optimizer, agent.critic.optimizer])
         actor_losses, critic_losses = [], []
         with th.no_grad():
@@ -65,8 +69,7 @@ class TD3Update:
                 critic_losses.append(self._update_critics(data, pairs))
                 if agent._n_updates % agent.policy_delay == 0:
                     actor_losses.append(self._update_actor(pairs))
-                    _polyak_update(agent.critic, agent.critic_target, agent.tau)
-                    _polyak_update(agent.actor, agent.actor_target, agent.tau)
+                    self._update_target_networks()
 
         agent.logger.record("train/n_updates", agent._n_updates, exclude="tensorboard")
         if actor_losses:
@@ -124,6 +127,11 @@ class TD3Update:
         _adam_step(self._agent.actor.optimizer)
         return float(-values.mean())
 
+    def _update_target_networks(self) -> None:
+        for targets, networks in self._targets_and_networks:
+            th._foreach_mul_(targets, 1 - self._agent.tau)
+            th._foreach_add_(targets, networks, alpha=self._agent.tau)
+
 
 def _check_optimizer(network: nn.Module) -> None:
     optimizer: Any = network.optimizer
@@ -148,12 +156,6 @@ def _pairs(observations: th.Tensor, actions: th.Tensor) -> th.Tensor:
     pairs[:n_obs] = observations.t()
     pairs[n_obs:] = actions.t()
     return pairs
-
-
-def _polyak_update(network: nn.Module, target: nn.Module, tau: float) -> None:
-    targets = [parameter.data for parameter in target.parameters()]
-    th._foreach_mul_(targets, 1 - tau)
-    th._foreach_add_(targets, [parameter.data for parameter in network.parameters()], alpha=tau)
 
 
 def _adam_step(optimizer: th.optim.Optimizer) -> None:
