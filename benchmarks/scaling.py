@@ -68,6 +68,25 @@ def exponent(results: list[dict[str, Any]]) -> float:
     return float(np.polyfit(values[:, 0], values[:, 1], 1)[0])
 
 
+def draw(env_id: str, results: list[dict[str, Any]]) -> None:
+    """One small picture for each setting that was varied."""
+    names = list(dict.fromkeys(r["varied"] for r in results))
+    figure, all_axes = pyplot.subplots(1, len(names), figsize=(3 * len(names), 3.2), squeeze=False)
+    for axes, name in zip(all_axes[0], names, strict=True):
+        shown = [r for r in results if r["varied"] == name]
+        values = [r["value"] for r in shown]
+        axes.loglog(values, [r["ms"] for r in shown], "o-")
+        axes.set_title(f"exponent {shown[0]['exponent']:.2f}", fontsize=9)
+        axes.set_xlabel(name)
+        axes.set_xticks(values, [str(value) for value in values])
+        axes.set_yticks([1, 2, 5, 10, 20, 50], ["1", "2", "5", "10", "20", "50"])
+        axes.minorticks_off()
+    all_axes[0, 0].set_ylabel("ms per decision")
+    figure.suptitle(f"{env_id}, varied around (6, 3, 5)", fontsize=10)
+    figure.tight_layout()
+    figure.savefig(RESULTS / "scaling.png", dpi=120)
+
+
 def main() -> None:
     """Measure, print, write."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -76,22 +95,13 @@ def main() -> None:
     args = parser.parse_args()
     matplotlib.use("agg")
     print(machine())
-    figure, all_axes = pyplot.subplots(1, len(VARIED), figsize=(15, 3.2))
     results: list[dict[str, Any]] = []
-    for axes, name in zip(all_axes, VARIED, strict=True):
+    for name in VARIED:
         found = measure(args.env, name, args.seconds)
-        fitted = exponent(found)
-        results += [{**result, "exponent": fitted} for result in found]
-        axes.loglog([r["value"] for r in found], [r["ms"] for r in found], "o-")
-        axes.set_title(f"exponent {fitted:.2f}", fontsize=9)
-        axes.set_xlabel(name)
-    all_axes[0].set_ylabel("ms per decision")
-    figure.suptitle(f"{args.env}, varied around (6, 3, 5)", fontsize=10)
-    figure.tight_layout()
-    RESULTS.mkdir(exist_ok=True)
-    figure.savefig(RESULTS / "scaling.png", dpi=120)
+        results += [{**result, "exponent": exponent(found)} for result in found]
     print_table(list(results[0]), [list(result.values()) for result in results])
     write("scaling", results)
+    draw(args.env, results)
 
 
 if __name__ == "__main__":

@@ -182,21 +182,23 @@ def measure(env_id: str, size: tuple[int, int, int], seconds: float) -> dict[str
 
 
 def draw(results: list[dict[str, Any]]) -> None:
-    """One group of bars per environment and size: floors, ours, the usual way."""
-    figure, axes = pyplot.subplots(figsize=(10, 4.5))
-    places = np.arange(len(results))
-    labels = [f"{r['env'].split('-')[0]}\n{','.join(map(str, r['size']))}" for r in results]
-    physics = np.array([r["physics floor ms"] for r in results])
-    axes.bar(places - 0.27, physics, 0.25, label="physics floor")
-    axes.bar(
-        places - 0.27, [r["network floor ms"] for r in results], 0.25, bottom=physics, label="network floor"
-    )
-    axes.bar(places, [r["ms"] for r in results], 0.25, label="sb3-mcbs")
-    axes.bar(places + 0.27, [r["usual way ms"] for r in results], 0.25, label="the usual way")
-    axes.set_yscale("log")
-    axes.set_ylabel("ms per decision")
-    axes.set_xticks(places, labels, fontsize=6)
-    axes.legend()
+    """One picture per environment, one group of bars per size: floors, ours, the usual way."""
+    envs = list(dict.fromkeys(r["env"] for r in results))
+    figure, all_axes = pyplot.subplots(1, len(envs), figsize=(3 * len(envs), 3.4), sharey=True, squeeze=False)
+    for axes, env_id in zip(all_axes[0], envs, strict=True):
+        shown = [r for r in results if r["env"] == env_id]
+        places = np.arange(len(shown))
+        floors = [r["physics floor ms"] + r["network floor ms"] for r in shown]
+        axes.bar(places - 0.27, floors, 0.25, label="physics + network floor", color="lightgrey")
+        axes.bar(places, [r["ms"] for r in shown], 0.25, label="sb3-mcbs")
+        axes.bar(places + 0.27, [r["usual way ms"] for r in shown], 0.25, label="the usual way")
+        period = shown[0]["control period ms"]
+        axes.axhline(period, linestyle=":", color="black", label="control period")
+        axes.set_yscale("log")
+        axes.set_title(env_id, fontsize=9)
+        axes.set_xticks(places, [",".join(map(str, r["size"])) for r in shown], fontsize=7)
+    all_axes[0, 0].set_ylabel("ms per decision")
+    all_axes[0, 0].legend(fontsize=7)
     figure.tight_layout()
     figure.savefig(RESULTS / "search.png", dpi=120)
 

@@ -54,6 +54,7 @@ def test_scaling_and_memory_and_deadline(monkeypatch):
     results = scaling.measure("HalfCheetah-v5", "beam_width", 0.1)
     assert [result["simulated steps"] for result in results] == [22, 44]
     assert np.isfinite(scaling.exponent(results))
+    scaling.draw("HalfCheetah-v5", [{**result, "exponent": 1.0} for result in results])
     agent = memory.make_agent("Pendulum-v1")
     assert len(memory.over_decisions(agent, 10, 5)) == 3
     assert len(memory.over_training(agent, 10, 5)) == 3
