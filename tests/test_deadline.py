@@ -163,17 +163,17 @@ def test_settings_are_checked():
 
 
 def test_an_agent_trains_and_acts_with_a_budget(make_agent, tmp_path):
-    agent = make_agent(time_budget=0.05, max_beam_width=12)
+    agent = make_agent(time_budget=30.0, max_beam_width=12)
     agent.learn(60)
     assert agent.n_decisions == 40 and agent.n_simulated_steps > 0
     agent.save(tmp_path / "agent")
     loaded = MCBSTD3.load(tmp_path / "agent", device="cpu")
-    assert loaded.time_budget == 0.05 and loaded.max_beam_width == 12
+    assert loaded.time_budget == 30.0 and loaded.max_beam_width == 12
     env = snapshot_vec_env("Pendulum-v1")
     policy = SearchPolicy(loaded, env, seed=0)
     observations = env.reset()
     for _ in range(3):
         actions, _ = policy.predict(observations)
         observations, *_ = env.step(actions)
-    assert policy.last_result.rounds >= 1
+    assert policy.last_result.rounds >= 1  # in 30 seconds, on any machine
     assert policy.last_result.values.shape[1] <= 12
