@@ -92,11 +92,10 @@ def main() -> None:
         axes.set_ylabel("resident memory [MB]")
         axes.set_ylim(min(seen) - 10, max(seen) + 10)
     figure.tight_layout()
-    RESULTS.mkdir(exist_ok=True)
-    figure.savefig(RESULTS / "memory.png", dpi=120)
     header = ["over", "number", "first MB", "last MB", "growth MB", "most MB above first"]
     print_table(header, rows)
     write("memory", [dict(zip(header, row, strict=True)) for row in rows])
+    figure.savefig(RESULTS / "memory.png", dpi=120)
 
 
 if __name__ == "__main__":

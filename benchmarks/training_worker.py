@@ -14,6 +14,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from benchmarks.common import NETWORKS
+
 WARM_UP = 400
 SIZES = {"MCBSTD3 (6,3,5)": (6, 3, 5), "MCBSTD3 (6,3,1)": (6, 3, 1), "MCBSTD3 (18,6,5)": (18, 6, 5)}
 
@@ -30,7 +32,7 @@ def settings(n_envs: int) -> dict[str, Any]:
         "train_freq": 1,
         "gradient_steps": -1 if n_envs > 1 else 1,
         "action_noise": NormalActionNoise(np.zeros(6), 0.1 * np.ones(6)),
-        "policy_kwargs": {"net_arch": [400, 300]},
+        "policy_kwargs": NETWORKS,
         "seed": 0,
     }
 
@@ -126,9 +128,9 @@ def main() -> None:
     arm, env_id, n_envs = sys.argv[1], sys.argv[2], int(sys.argv[3])
     probe = gym.make(env_id)
     act_dim = probe.action_space.shape[0]  # type: ignore[index]
-    agent = make_agent(arm, env_id, n_envs)
     if act_dim != 6:
         raise SystemExit(f"{env_id} has {act_dim} action entries; the noise of the settings is for 6")
+    agent = make_agent(arm, env_id, n_envs)
     agent.learn(WARM_UP + 100)
     stopwatch = watch_parts(agent)
     print("ready", flush=True)

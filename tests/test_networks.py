@@ -74,7 +74,7 @@ def test_present_parameters_and_networks_are_used():
     np.testing.assert_allclose(policy(observations), sb3_action(other, observations), rtol=1e-5, atol=1e-6)
 
 
-def test_hooks_run(monkeypatch):
+def test_hooks_run():
     agent = agent_of(TD3)
     agent.actor.mu[1].register_forward_hook(lambda module, inputs, output: output * 0)
     bias = agent.actor.mu[2].bias

@@ -86,11 +86,17 @@ def critic_mlps(critic: Any) -> list[MLP]:
     return [MLP(network) for network in critic.q_networks]
 
 
-def _or_none(make: Callable[[Any], _T], network: Any) -> _T | None:
-    try:
-        return make(network)
-    except TypeError:
-        return None
+def _if_plain(make: Callable[[Any], _T]) -> Callable[[Any], _T | None]:
+    """``make``, with None for a network that it refuses; asked again only when there is another network."""
+
+    @functools.lru_cache(maxsize=1)
+    def made(network: Any) -> _T | None:
+        try:
+            return make(network)
+        except TypeError:
+            return None
+
+    return made
 
 
 def _columns(first: np.ndarray, second: np.ndarray | None, device: th.device) -> th.Tensor:
@@ -119,14 +125,11 @@ def policy_function(agent: OffPolicyAlgorithm) -> Callable[[Observations], np.nd
     """
     policy_network: Any = agent.policy
     stochastic = isinstance(agent, SAC | TQC)
-    known: nn.Module | None = None
-    mlp: MLP | None = None
+    mlp_of = _if_plain(actor_mlp)
 
     def policy(observations: Observations) -> np.ndarray:
-        nonlocal known, mlp
         actor = policy_network.actor
-        if actor is not known:
-            known, mlp = actor, _or_none(actor_mlp, actor)
+        mlp = mlp_of(actor)
         if mlp is not None:
             assert isinstance(observations, np.ndarray)
             return _to_numpy(mlp(_columns(observations, None, agent.device)), agent.device).T
@@ -146,14 +149,11 @@ def value_function(agent: OffPolicyAlgorithm) -> Callable[[Observations, np.ndar
     """
     policy_network: Any = agent.policy
     quantiles = isinstance(agent, TQC)
-    known: nn.Module | None = None
-    mlps: list[MLP] | None = None
+    mlps_of = _if_plain(critic_mlps)
 
     def value(observations: Observations, actions: np.ndarray) -> np.ndarray:
-        nonlocal known, mlps
         critic = policy_network.critic
-        if critic is not known:
-            known, mlps = critic, _or_none(critic_mlps, critic)
+        mlps = mlps_of(critic)
         if mlps is not None:
             assert isinstance(observations, np.ndarray)
             inputs = _columns(observations, actions, agent.device)

@@ -92,16 +92,23 @@ class OutOfTimeError(Exception):
         self.simulated_steps = simulated_steps
 
 
-def draw_noise(rng: np.random.Generator, settings: SearchSettings, n_envs: int, act_dim: int) -> Noise:
+def draw_noise(
+    rng: np.random.Generator,
+    settings: SearchSettings,
+    n_envs: int,
+    act_dim: int,
+    beam_width: int | None = None,
+) -> Noise:
     """Draw the noise of one decision.
 
     :param rng: generator of the search.
     :param settings: width, depth, simulations and noise scales.
     :param n_envs: number of environments.
     :param act_dim: entries of one action.
+    :param beam_width: candidates; ``None``: as many as the settings say.
     :return: the noise, clipped to ``noise_clip`` if that is set.
     """
-    b, d, n = settings.beam_width, settings.rollout_depth, settings.n_simulations
+    b, d, n = beam_width or settings.beam_width, settings.rollout_depth, settings.n_simulations
     beam = _gaussian(rng, (n_envs, b, act_dim), settings.beam_noise, settings.noise_clip)
     rollout = _gaussian(
         rng, (d, n_envs, b, n, act_dim), settings.effective_rollout_noise, settings.noise_clip

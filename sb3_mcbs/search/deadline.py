@@ -3,7 +3,6 @@
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -191,7 +190,7 @@ def deadline_search(
         if width == 0:
             break
         watch = _Watch(pace, width, deadline)
-        noise = draw_noise(rng, replace(settings, beam_width=width, max_beam_width=None), n_envs, act_dim)
+        noise = draw_noise(rng, settings, n_envs, act_dim, beam_width=width)
         proposed = propose(policy_actions, noise.beam, settings.include_policy_action and done == 0)
         try:
             round_values, first_step, steps = rollout_values(
