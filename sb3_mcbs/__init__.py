@@ -2,7 +2,14 @@
 
 from importlib.metadata import PackageNotFoundError, version
 
-from sb3_mcbs.algorithms import MCBSTD3, SearchPolicy
+from sb3_mcbs.algorithms import (
+    MCBSTD3,
+    AgentFileError,
+    SearchPolicy,
+    load_agent,
+    load_statistics,
+    save_statistics,
+)
 from sb3_mcbs.search import SearchSettings
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 
@@ -11,4 +18,14 @@ try:
 except PackageNotFoundError:  # a checkout that was not installed
     __version__ = "0+unknown"
 
-__all__ = ["MCBSTD3", "SearchPolicy", "SearchSettings", "SnapshotEnvWrapper", "__version__"]
+__all__ = [
+    "MCBSTD3",
+    "AgentFileError",
+    "SearchPolicy",
+    "SearchSettings",
+    "SnapshotEnvWrapper",
+    "__version__",
+    "load_agent",
+    "load_statistics",
+    "save_statistics",
+]

@@ -7,6 +7,7 @@ COMMANDS = {
     "train": ("sb3_mcbs.zoo.train", "train an agent: the arguments of python -m rl_zoo3.train"),
     "repeat": ("sb3_mcbs.zoo.repeat", "repeat a run from its folder"),
     "report": ("sb3_mcbs.zoo.report", "returns and learning curve of a run's two policies"),
+    "convert-statistics": ("sb3_mcbs.zoo.convert_statistics", "write a trusted vecnormalize.pkl as npz"),
 }
 
 
@@ -14,7 +15,7 @@ def main() -> None:
     """Run the command that the first argument names."""
     name = sys.argv[1] if len(sys.argv) > 1 else ""
     if name not in COMMANDS:
-        lines = [f"  {command:8} {text}" for command, (_, text) in COMMANDS.items()]
+        lines = [f"  {command:18} {text}" for command, (_, text) in COMMANDS.items()]
         print("\n".join(["usage: sb3-mcbs COMMAND [ARGUMENTS]", "", *lines]))
         sys.exit(0 if name in ("-h", "--help") else f"sb3-mcbs: unknown command {name!r}" if name else 2)
     # The command sees itself as the program, as after python -m.
