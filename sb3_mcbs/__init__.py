@@ -10,6 +10,8 @@ from sb3_mcbs.algorithms import (
     load_statistics,
     save_statistics,
 )
+from sb3_mcbs.algorithms.faults import NonFiniteError
+from sb3_mcbs.models import WorkerError
 from sb3_mcbs.search import SearchSettings
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 
@@ -21,9 +23,11 @@ except PackageNotFoundError:  # a checkout that was not installed
 __all__ = [
     "MCBSTD3",
     "AgentFileError",
+    "NonFiniteError",
     "SearchPolicy",
     "SearchSettings",
     "SnapshotEnvWrapper",
+    "WorkerError",
     "__version__",
     "load_agent",
     "load_statistics",

@@ -9,7 +9,13 @@ import pytest
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
-from sb3_mcbs.models import ForwardModelError, LocalEnvironments, WorkerEnvironments, make_forward_model
+from sb3_mcbs.models import (
+    ForwardModelError,
+    LocalEnvironments,
+    WorkerEnvironments,
+    WorkerError,
+    make_forward_model,
+)
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 
 
@@ -134,6 +140,6 @@ def test_a_worker_that_has_ended_is_reported() -> None:
     environments = WorkerEnvironments(vec_env)
     vec_env.processes[0].kill()
     vec_env.processes[0].join()
-    with pytest.raises(ForwardModelError, match="worker process of environment 0 has ended"):
+    with pytest.raises(WorkerError, match=r"environment 0 was killed by SIGKILL \(exit code -9\)"):
         environments.apply([0], describe)
-    vec_env.closed = True
+    vec_env.close()

@@ -8,11 +8,20 @@ import numpy as np
 import torch as th
 from stable_baselines3 import TD3
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, Schedule
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from stable_baselines3.td3.policies import TD3Policy
 
+from sb3_mcbs.algorithms.faults import (
+    CheckedVecEnv,
+    check_observations,
+    diverged_environments,
+    environment_named,
+    leave_out_step,
+    warn_of_divergence,
+)
 from sb3_mcbs.algorithms.searcher import Searcher
 from sb3_mcbs.algorithms.td3_update import TD3Update
 from sb3_mcbs.algorithms.torch_settings import matmul_precision
@@ -176,9 +185,11 @@ class MCBSTD3(TD3):
         self.n_decisions = 0
         self.n_simulated_steps = 0
         self.n_invalid_rollouts = 0
+        self.n_diverged_steps = 0
         self._searcher: Searcher | None = None
         self._decision: SearchResult | None = None
         self._update: TD3Update | None = None
+        self._checked_env: CheckedVecEnv | None = None
 
         if _init_setup_model:
             self._setup_model()
@@ -274,6 +285,14 @@ class MCBSTD3(TD3):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
+        diverged = diverged_environments(infos)
+        if diverged and self.n_diverged_steps == 0:
+            warn_of_divergence(buffer_action, diverged, self.num_timesteps)
+        self.n_diverged_steps += len(diverged)
+        self.logger.record("rollout/diverged_steps", self.n_diverged_steps)
+        if diverged:
+            leave_out_step(self, replay_buffer, new_obs)
+            return
         if self._decision is not None:
             assert self._searcher is not None
             normalizer = self._vec_normalize_env
@@ -282,6 +301,16 @@ class MCBSTD3(TD3):
             if error is not None:
                 self.logger.record_mean("search/model_error", error)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+
+    def collect_rollouts(self, env: VecEnv, *args: Any, **kwargs: Any) -> RolloutReturn:
+        if self._checked_env is None or self._checked_env.venv is not env:
+            self._checked_env = CheckedVecEnv(env)
+        return super().collect_rollouts(self._checked_env, *args, **kwargs)
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        result = super()._setup_learn(*args, **kwargs)
+        check_observations(self._last_obs)
+        return result
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
         """
@@ -324,14 +353,11 @@ class MCBSTD3(TD3):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfMCBSTD3:
-        return super().learn(
-            total_timesteps=total_timesteps,
-            callback=callback,
-            log_interval=log_interval,
-            tb_log_name=tb_log_name,
-            reset_num_timesteps=reset_num_timesteps,
-            progress_bar=progress_bar,
-        )
+        assert self.env is not None, "learn() needs an environment: call set_env()"
+        with environment_named(self.env):
+            return super().learn(
+                total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
+            )
 
     def predict(
         self,
@@ -352,4 +378,4 @@ class MCBSTD3(TD3):
         return super().predict(observation, state, episode_start, deterministic)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_searcher", "_decision", "_update"]
+        return [*super()._excluded_save_params(), "_searcher", "_decision", "_update", "_checked_env"]

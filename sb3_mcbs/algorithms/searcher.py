@@ -10,6 +10,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_mcbs.algorithms.faults import NonFiniteError, check_observations, is_finite
 from sb3_mcbs.algorithms.networks import check_agent, policy_function, value_function
 from sb3_mcbs.algorithms.torch_settings import matmul_precision, one_thread
 from sb3_mcbs.algorithms.vec_env_view import VecEnvView, reward_normalizer, snapshot_environments
@@ -78,6 +79,7 @@ class Searcher:
         :param rng: the search's own generator.
         :return: actions, and what the search found.
         :raises ValueError: if the observations are not those of the environments' present states.
+        :raises NonFiniteError: if the networks, or the observations, are not finite.
         """
         start = self._pace.clock()
         if self.agent.policy.training:
@@ -90,12 +92,16 @@ class Searcher:
         with one_thread(), matmul_precision(settings.matmul_precision):
             if settings.time_budget is None:
                 noise = draw_noise(rng, settings, _n_rows(observations), self._act_dim)
-                return beam_search(self.model, roots, observations, agent, settings, noise, rng)
-            assert self.model is not None
-            deadline = start + settings.time_budget
-            return deadline_search(
-                self.model, roots, observations, agent, settings, deadline, self._pace, rng
-            )
+                result = beam_search(self.model, roots, observations, agent, settings, noise, rng)
+            else:
+                assert self.model is not None
+                deadline = start + settings.time_budget
+                result = deadline_search(
+                    self.model, roots, observations, agent, settings, deadline, self._pace, rng
+                )
+        if result.invalid_rollouts or not is_finite(result.actions):
+            _check_networks(agent, observations)
+        return result
 
     def model_error(
         self,
@@ -181,6 +187,7 @@ class Searcher:
             raise ValueError("Reset the vectorized environment before the first search.")
         stacked = stack(present)
         if not _equal(self.view.observe(stacked), observations):
+            check_observations(stacked)  # NaN is not equal to itself
             raise ValueError(
                 "The observations to act on are not those of the environments' present states. A search "
                 "plans from the environments it was given: act in those, step them only through their "
@@ -226,6 +233,27 @@ class Searcher:
     def _warn(message: str) -> None:
         logger.warning(message)
         warnings.warn(message, stacklevel=4)
+
+
+def _check_networks(agent: Agent, observations: Observations) -> None:
+    """Tell networks that diverged from rollouts that did.
+
+    :param observations: ``[n_envs, *]``, present observations.
+    :raises NonFiniteError: if it is the networks, or the environments.
+    """
+    check_observations(observations)
+    actions = agent.policy(observations)
+    if not is_finite(actions):
+        answer = "The actor answers"
+    elif not is_finite(agent.value(observations, actions)):
+        answer = "The critics answer"
+    else:
+        return
+    raise NonFiniteError(
+        f"{answer} the present observations with NaN or infinity: the networks have diverged, and no action "
+        "can be chosen. Go back to an agent that was saved earlier, and train with a lower "
+        "learning_rate, or with rewards and observations on a smaller scale (VecNormalize)."
+    )
 
 
 def _last_observation(env: SnapshotEnvWrapper) -> Any:

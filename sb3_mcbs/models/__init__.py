@@ -8,6 +8,7 @@ from sb3_mcbs.models.factory import make_forward_model
 from sb3_mcbs.models.families import Constants, Family, Fields, Outcome, Rows, register_family
 from sb3_mcbs.models.mujoco_batch import MujocoBatchModel
 from sb3_mcbs.models.pool import EnvPoolModel
+from sb3_mcbs.models.workers import WorkerError
 
 del _families, _small_families
 
@@ -26,6 +27,7 @@ __all__ = [
     "Rows",
     "Transition",
     "WorkerEnvironments",
+    "WorkerError",
     "make_forward_model",
     "register_family",
 ]

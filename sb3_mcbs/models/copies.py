@@ -9,12 +9,15 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 from gymnasium import spaces
-from gymnasium.envs.mujoco import MujocoEnv
 
 from sb3_mcbs.models.base import Observations
-from sb3_mcbs.models.engines import clear_warnings, has_diverged
 from sb3_mcbs.models.probing import Randomness, isolated_globals, probe_randomness
-from sb3_mcbs.snapshot import Snapshot, SnapshotEnvWrapper, SnapshotMismatchError
+from sb3_mcbs.snapshot import (
+    SIMULATION_DIVERGED,
+    Snapshot,
+    SnapshotEnvWrapper,
+    SnapshotMismatchError,
+)
 
 
 def stack(observations: list[Any]) -> Observations:
@@ -82,19 +85,14 @@ class _Row:
         self.reward = 0.0
         if self.ended:
             return None
-        base = self.env.unwrapped
-        simulator = base.data if isinstance(base, MujocoEnv) else None
-        if simulator is not None:
-            clear_warnings(simulator)
         try:
-            observation, reward, terminated, _, _ = self.env.step(action.copy())
+            observation, reward, terminated, _, info = self.env.step(action.copy())
         except Exception as error:
             self.ended, self.valid = True, False
             return error
         self.observation, self.reward, self.terminated = _copied(observation), float(reward), bool(terminated)
-        self.valid = _is_finite(self.observation) and bool(np.isfinite(self.reward))
-        if simulator is not None:
-            self.valid = self.valid and not has_diverged(simulator)
+        finite = _is_finite(self.observation) and bool(np.isfinite(self.reward))
+        self.valid = finite and SIMULATION_DIVERGED not in info
         # Truncation is left out on purpose: a time limit does not end a simulation.
         self.ended = self.terminated or not self.valid
         return None

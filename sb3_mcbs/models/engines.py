@@ -14,6 +14,8 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch, SimulationError
 
+from sb3_mcbs.snapshot.mujoco import DIVERGENCE_WARNINGS
+
 INTEGRATION = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 #: State components that a transition can read, and where they lie in a state row.
@@ -27,34 +29,12 @@ _STATE_FIELDS = {
     "mocap_quat": mujoco.mjtState.mjSTATE_MOCAP_QUAT,
 }
 
-_BAD_NUMBERS = [
-    int(mujoco.mjtWarning.mjWARN_BADQPOS),
-    int(mujoco.mjtWarning.mjWARN_BADQVEL),
-    int(mujoco.mjtWarning.mjWARN_BADQACC),
-    int(mujoco.mjtWarning.mjWARN_BADCTRL),
-]
-# They follow each other, and a slice is quicker than a list of indices.
-_BAD = slice(min(_BAD_NUMBERS), max(_BAD_NUMBERS) + 1)
-
 
 def available_cpus() -> int:
     """How many processors this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
-
-
-def clear_warnings(data: mujoco.MjData) -> None:
-    """Forget past warnings, so that :func:`has_diverged` speaks of what comes next."""
-    data.warning.number[:] = 0
-
-
-def has_diverged(data: mujoco.MjData) -> bool:
-    """Whether MuJoCo found bad numbers, after which it resets the simulation and carries on.
-
-    A full contact or constraint buffer is no divergence.
-    """
-    return bool(data.warning.number[_BAD].any())
 
 
 def is_state_field(name: str) -> bool:
@@ -127,7 +107,7 @@ class BatchEngine(Engine):
         self.state = self._batch.state
         self._derived = {name: self._batch.bind(name) for name in fields if not is_state_field(name)}
         self._ids = np.arange(capacity, dtype=np.int32)
-        self._warning = self._batch.warning[:, _BAD, 1]
+        self._warning = self._batch.warning[:, DIVERGENCE_WARNINGS, 1]
 
     def _derived_field(self, name: str) -> np.ndarray:
         return self._derived[name]
@@ -206,7 +186,7 @@ class ThreadEngine(Engine):
             mujoco.mj_getState(model, data, state, INTEGRATION)
             for source, target in sources:
                 target[row] = source
-            self._diverged[row] = number[_BAD].any()
+            self._diverged[row] = number[DIVERGENCE_WARNINGS].any()
 
     def close(self) -> None:
         if self._threads is not None:

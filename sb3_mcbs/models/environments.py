@@ -10,6 +10,7 @@ import cloudpickle
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
 from sb3_mcbs.models.base import ForwardModelError
+from sb3_mcbs.models.workers import await_answers, collect_tracebacks, worker_error
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 
 
@@ -32,6 +33,7 @@ class Environments(ABC):
             environment lives.
         :param args_per_env: the arguments for each of ``env_indices``.
         :return: the results, in the order of ``env_indices``.
+        :raises WorkerError: if the worker process of an environment has ended.
         """
 
     def apply(self, env_indices: Sequence[int], function: Callable[..., Any], *args: Any) -> list[Any]:
@@ -91,6 +93,7 @@ class WorkerEnvironments(Environments):
                 "wrapper_class=SnapshotEnvWrapper to make_vec_env"
             )
         self.vec_env = inner
+        collect_tracebacks(inner)
 
     def __len__(self) -> int:
         return self.vec_env.num_envs
@@ -102,11 +105,17 @@ class WorkerEnvironments(Environments):
         remotes = [self.vec_env.remotes[i] for i in env_indices]
         # Packed here: what a worker cannot unpack would otherwise end the worker without a word.
         calls = [cloudpickle.dumps((function, tuple(args))) for args in args_per_env]
-        failures = [self._send(remote, call) for remote, call in zip(remotes, calls, strict=True)]
-        # All answers are taken before any is judged, so that the pipes stay in step.
-        answers = [
-            failure or self._receive(remote) for remote, failure in zip(remotes, failures, strict=True)
-        ]
+        try:
+            for remote, call in zip(remotes, calls, strict=True):
+                remote.send(("env_method", ("apply", (_run_call, call), {})))
+            await_answers(self.vec_env, env_indices)
+            # All answers are taken before any is judged, so that the pipes stay in step.
+            answers = [remote.recv() for remote in remotes]
+        except (EOFError, OSError) as error:
+            reason = worker_error(self.vec_env)
+            if reason is None:
+                raise
+            raise reason from error
         return [self._unpack(i, answer) for i, answer in zip(env_indices, answers, strict=True)]
 
     @staticmethod
@@ -119,25 +128,7 @@ class WorkerEnvironments(Environments):
             )
 
     @staticmethod
-    def _send(remote: Any, call: bytes) -> Exception | None:
-        try:
-            remote.send(("env_method", ("apply", (_run_call, call), {})))
-        except OSError as error:
-            return error
-        return None
-
-    @staticmethod
-    def _receive(remote: Any) -> bytes | Exception:
-        try:
-            answer: bytes = remote.recv()
-        except (EOFError, OSError) as error:
-            return error
-        return answer
-
-    @staticmethod
-    def _unpack(env_index: int, answer: bytes | Exception) -> Any:
-        if isinstance(answer, Exception):
-            raise ForwardModelError(f"the worker process of environment {env_index} has ended") from answer
+    def _unpack(env_index: int, answer: bytes) -> Any:
         error, result, trace = pickle.loads(answer)
         if error is not None:
             raise error from RuntimeError(f"in the worker process of environment {env_index}:\n{trace}")

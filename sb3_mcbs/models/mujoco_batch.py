@@ -22,6 +22,7 @@ from sb3_mcbs.models.recognition import (
     recognize,
     sample_transitions,
 )
+from sb3_mcbs.models.workers import WorkerError
 
 _FIRST_CAPACITY = 32
 
@@ -75,7 +76,7 @@ class MujocoBatchModel(ForwardModel):
         try:
             self._prepare(known)
             self._check()
-        except ForwardModelError:
+        except (ForwardModelError, WorkerError):
             raise
         except Exception as error:
             # An array function that does not fit: whoever asked for "auto" still has the pool.

@@ -20,6 +20,7 @@ from sb3_mcbs.models.copies import (
     step_rows,
 )
 from sb3_mcbs.models.environments import Environments
+from sb3_mcbs.models.workers import WorkerError
 from sb3_mcbs.snapshot import Snapshot
 
 logger = logging.getLogger("sb3_mcbs")
@@ -112,7 +113,7 @@ class EnvPoolModel(ForwardModel):
 
     def close(self) -> None:
         # Worker processes that have ended took their copies with them.
-        with contextlib.suppress(ForwardModelError):
+        with contextlib.suppress(ForwardModelError, WorkerError):
             self._environments.apply(range(len(self._environments)), drop_copies, self._name)
         self._counts = {}
 

@@ -1,6 +1,7 @@
 """The settings of a search, checked once and then immutable."""
 
 import math
+import sys
 from dataclasses import dataclass, fields
 from numbers import Integral, Real
 from typing import Any
@@ -10,6 +11,10 @@ from sb3_mcbs.models.factory import KINDS
 #: More rollouts than this per environment are a mistake, not a search: memory would run out.
 MAX_ROLLOUTS = 100_000
 MAX_DEPTH = 10_000
+#: Steps of one decision and environment: the noise of all of them is drawn at once.
+MAX_STEPS = 10_000_000
+#: Anything above clips every action to a corner, and float32 must be able to hold it.
+MAX_NOISE = 1e6
 MAX_THREADS = 1024
 MATMUL_PRECISIONS = ("highest", "high", "medium")
 
@@ -59,45 +64,78 @@ class SearchSettings:
     max_beam_width: int | None = None
 
     def __post_init__(self) -> None:
-        _check_integer("beam_width", self.beam_width, 1, MAX_ROLLOUTS)
-        _check_integer("rollout_depth", self.rollout_depth, 0, MAX_DEPTH)
-        _check_integer("n_simulations", self.n_simulations, 1, MAX_ROLLOUTS)
-        _check_integer("n_threads", self.n_threads, 0, MAX_THREADS)
-        if self.beam_width * self.n_simulations > MAX_ROLLOUTS:
-            raise ValueError(
-                f"beam_width * n_simulations is {self.beam_width * self.n_simulations} rollouts per "
-                f"environment; at most {MAX_ROLLOUTS} are supported."
-            )
-        _check_number("beam_noise", self.beam_noise)
+        self._set_integer("beam_width", 1, MAX_ROLLOUTS)
+        self._set_integer("rollout_depth", 0, MAX_DEPTH)
+        self._set_integer("n_simulations", 1, MAX_ROLLOUTS)
+        self._set_integer("n_threads", 0, MAX_THREADS)
+        self._set_number("beam_noise", MAX_NOISE)
         if self.rollout_noise is not None:
-            _check_number("rollout_noise", self.rollout_noise)
+            self._set_number("rollout_noise", MAX_NOISE)
         if self.noise_clip is not None:
-            _check_number("noise_clip", self.noise_clip)
+            self._set_number("noise_clip", MAX_NOISE)
         if not isinstance(self.include_policy_action, bool):
             raise TypeError(
                 f"include_policy_action must be True or False, got {self.include_policy_action!r}."
             )
-        if self.forward_model not in KINDS:
+        # Names are compared as strings only: an array, say, has no answer to whether it is in a tuple.
+        if not isinstance(self.forward_model, str) or self.forward_model not in KINDS:
             raise ValueError(f"forward_model must be one of {KINDS}, got {self.forward_model!r}.")
-        if self.matmul_precision not in (None, *MATMUL_PRECISIONS):
+        precision = self.matmul_precision
+        if precision is not None and not (isinstance(precision, str) and precision in MATMUL_PRECISIONS):
             raise ValueError(
                 f"matmul_precision must be one of {MATMUL_PRECISIONS} or None, got {self.matmul_precision!r}."
             )
 
         self._check_budget()
+        self._check_size("max_beam_width" if self.max_beam_width is not None else "beam_width")
+
+    def _check_size(self, width_name: str) -> None:
+        rollouts = getattr(self, width_name) * self.n_simulations
+        if rollouts > MAX_ROLLOUTS:
+            raise ValueError(
+                f"{width_name} * n_simulations is {rollouts} rollouts per environment; at most "
+                f"{MAX_ROLLOUTS} are supported."
+            )
+        if rollouts * self.rollout_depth > MAX_STEPS:
+            raise ValueError(
+                f"{width_name} * n_simulations * rollout_depth is {rollouts * self.rollout_depth} steps per "
+                f"environment; at most {MAX_STEPS} are supported."
+            )
 
     def _check_budget(self) -> None:
         if self.time_budget is not None:
-            _check_number("time_budget", self.time_budget)
+            self._set_number("time_budget", sys.float_info.max)
             if self.time_budget <= 0 or self.rollout_depth == 0:
                 raise ValueError(
                     f"time_budget must be above 0 seconds, and needs a rollout_depth of 1 or more; got "
                     f"{self.time_budget} with rollout_depth={self.rollout_depth}."
                 )
         if self.max_beam_width is not None:
-            _check_integer("max_beam_width", self.max_beam_width, self.beam_width, MAX_ROLLOUTS)
+            self._set_integer("max_beam_width", self.beam_width, MAX_ROLLOUTS)
             if self.time_budget is None:
                 raise ValueError("max_beam_width needs a time_budget; without one set beam_width.")
+
+    def _set_integer(self, name: str, low: int, high: int) -> None:
+        value = getattr(self, name)
+        if isinstance(value, bool) or not isinstance(value, Integral):
+            raise TypeError(f"{name} must be an integer, got {value!r}.")
+        if not low <= int(value) <= high:
+            raise ValueError(f"{name} must be between {low} and {high}, got {value}.")
+        # NumPy's integers have few bits, and products of settings overflow.
+        object.__setattr__(self, name, int(value))
+
+    def _set_number(self, name: str, high: float) -> None:
+        value = getattr(self, name)
+        if isinstance(value, bool) or not isinstance(value, Real):
+            raise TypeError(f"{name} must be a number, got {value!r}.")
+        try:
+            number = float(value)
+        except OverflowError:
+            number = math.inf
+        # NaN is not between anything.
+        if not 0 <= number <= high:
+            raise ValueError(f"{name} must be finite, not negative and at most {high:g}, got {value}.")
+        object.__setattr__(self, name, number)
 
     @property
     def effective_rollout_noise(self) -> float:
@@ -117,17 +155,3 @@ class SearchSettings:
         :return: the checked settings.
         """
         return cls(**{name: getattr(agent, name) for name in cls.names()})
-
-
-def _check_integer(name: str, value: Any, low: int, high: int) -> None:
-    if isinstance(value, bool) or not isinstance(value, Integral):
-        raise TypeError(f"{name} must be an integer, got {value!r}.")
-    if not low <= int(value) <= high:
-        raise ValueError(f"{name} must be between {low} and {high}, got {value}.")
-
-
-def _check_number(name: str, value: Any) -> None:
-    if isinstance(value, bool) or not isinstance(value, Real):
-        raise TypeError(f"{name} must be a number, got {value!r}.")
-    if not (math.isfinite(value) and float(value) >= 0):
-        raise ValueError(f"{name} must be finite and not negative, got {value}.")

@@ -1,6 +1,7 @@
 """Exact snapshots of environments."""
 
 from sb3_mcbs.snapshot.errors import SnapshotError, SnapshotMismatchError, SnapshotUnsupportedError
+from sb3_mcbs.snapshot.faults import SIMULATION_DIVERGED
 from sb3_mcbs.snapshot.registry import SnapshotAdapter, register_adapter
 from sb3_mcbs.snapshot.replay import ReplayAdapter, renew_world, uses_box2d
 from sb3_mcbs.snapshot.wrapper import Snapshot, SnapshotEnvWrapper
@@ -15,6 +16,7 @@ else:
     register_adapter(is_data, MjDataAdapter())
 
 __all__ = [
+    "SIMULATION_DIVERGED",
     "ReplayAdapter",
     "Snapshot",
     "SnapshotAdapter",

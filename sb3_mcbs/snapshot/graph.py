@@ -78,6 +78,8 @@ class Freezer:
 
     def __init__(self, kind_of: Callable[[Any], Kind | None], known: dict[int, Ref], n_known: int) -> None:
         self.nodes: list[Node] = [("known", None)] * n_known
+        #: The objects that adapters captured.
+        self.adapted: list[Any] = []
         self._kind_of = kind_of
         self._memo = dict(known)
         # An id is only unique among objects that live, and some objects on the way are temporary.

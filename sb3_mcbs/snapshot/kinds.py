@@ -83,6 +83,7 @@ class AdapterKind:
     def freeze(self, freezer: Freezer, obj: Any) -> Any:
         adapter = find_adapter(obj)
         assert adapter is not None
+        freezer.adapted.append(obj)
         return class_name(type(obj)), adapter.capture(obj)
 
     def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:

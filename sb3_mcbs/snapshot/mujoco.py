@@ -26,6 +26,16 @@ _MAX_SPARES = 128
 _TELLING = ("nq", "nv", "nu", "nbody", "njnt", "ngeom")
 _MAX_SPARE_MODELS = 16
 
+_BAD_NUMBERS = [
+    int(mujoco.mjtWarning.mjWARN_BADQPOS),
+    int(mujoco.mjtWarning.mjWARN_BADQVEL),
+    int(mujoco.mjtWarning.mjWARN_BADQACC),
+    int(mujoco.mjtWarning.mjWARN_BADCTRL),
+]
+#: The warnings after which MuJoCo resets the simulation or its controls. They follow each other, and a slice
+#: is quicker than a list of indices. A full contact or constraint buffer is no divergence.
+DIVERGENCE_WARNINGS = slice(min(_BAD_NUMBERS), max(_BAD_NUMBERS) + 1)
+
 
 class _ModelLayout:
     """Where the values of one ``MjModel`` lie in memory, as few long blocks.
@@ -309,6 +319,20 @@ class MjDataAdapter(SnapshotAdapter):
         data = mujoco.MjData(model)
         mujoco.mj_copyData(data, model, obj)
         return data
+
+    def watch(self, obj: Any) -> Callable[[], bool]:
+        # A view of MuJoCo's own memory: making it takes longer than reading it. Time that runs backwards is
+        # no sign of its own: environments may reset their simulator on purpose, which clears the warnings.
+        numbers = obj.warning.number[DIVERGENCE_WARNINGS]
+
+        def diverged() -> bool:
+            if not any(numbers.tolist()):
+                return False
+            # MuJoCo clears the warnings when it resets itself, so that a count does not grow each time.
+            obj.warning.number[DIVERGENCE_WARNINGS] = 0
+            return True
+
+        return diverged
 
     def clone_view(self, obj: Any, new: Any, array: np.ndarray) -> np.ndarray | None:
         return _counterpart(obj, new, array)

@@ -72,6 +72,18 @@ class SnapshotAdapter(ABC):
         :param seed: non-negative, below 2**63.
         """
 
+    def watch(self, obj: Any) -> Callable[[], bool] | None:
+        """Give a function that says whether a simulator gave up its state by itself.
+
+        Some simulators do not fail when they diverge: they start afresh, and all their numbers are finite.
+        The function is called after every step of the environment, so it has to be quick.
+
+        :param obj: the object.
+        :return: called without arguments; True if that happened since the last call. None if the object
+            never does so, or fails loudly.
+        """
+        return None
+
     def clone_view(self, obj: Any, new: Any, array: Any) -> Any:
         """Find in a cloned object the array that corresponds to a view into the original.
 

@@ -1,8 +1,9 @@
 """The state of a stack of layers: captured, checked, put back, cloned."""
 
 import contextlib
+import operator
 import random
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -46,6 +47,10 @@ class Stack:
         self._names = [layer.name for layer in self._stateful]
         self._adapters: dict[int, SnapshotAdapter] = {}
         self._owner = owner
+        self.monitors = [layer.env for layer in self._layers if layer.monitor]
+        #: Each says whether a simulator gave up its state since it was called last.
+        self.watches: list[Callable[[], bool]] = []
+        self._watched: list[Any] | None = None
         for layer in self._layers:
             if layer.name == _NEEDS_RENDERING:
                 raise SnapshotUnsupportedError(
@@ -76,7 +81,34 @@ class Stack:
         """
         freezer = Freezer(kind_of, self._refs, len(self._stateful))
         frozen = tuple([self._freeze_layer(freezer, layer) for layer in self._stateful])
+        self._watch(freezer.adapted)
         return frozen, tuple(freezer.nodes)
+
+    def find_simulators(self) -> None:
+        """Watch the simulators that are there now: a reset of the environment may exchange its own."""
+        if not self.watches:
+            return
+        present = {id(value) for layer in self._layers for value in vars(layer.env).values()}
+        if not all(id(obj) in present for obj in self._watched or ()):
+            # Whoever takes a snapshot is told what cannot be captured.
+            with contextlib.suppress(SnapshotUnsupportedError):
+                self.freeze()
+
+    def _watch(self, held: list[Any]) -> None:
+        """Watch simulators.
+
+        :param held: the objects with an adapter that the layers hold.
+        """
+        known = self._watched
+        if known is not None and len(held) == len(known) and all(map(operator.is_, held, known)):
+            return
+        self._watched = held
+        self.watches = []
+        for obj in (*held, *(layer.env for layer in self._layers)):
+            adapter = find_adapter(obj)
+            watch = None if adapter is None else adapter.watch(obj)
+            if watch is not None:
+                self.watches.append(watch)
 
     def _freeze_layer(self, freezer: Freezer, layer: Layer) -> FrozenLayer:
         adapter = self._adapters.get(id(layer.env))

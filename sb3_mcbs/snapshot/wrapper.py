@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_mcbs.snapshot.errors import SnapshotMismatchError
+from sb3_mcbs.snapshot.faults import diverged_step
 from sb3_mcbs.snapshot.graph import Node, RngMode, private_copy
 from sb3_mcbs.snapshot.layers import describe_space
 from sb3_mcbs.snapshot.state import FrozenLayer, Stack
@@ -82,16 +83,26 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
         """
         observation, info = self.env.reset(seed=seed, options=options)
         self.last_observation = private_copy(observation)
+        self._stack.find_simulators()
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Step the environment.
 
+        Where a simulator diverges and starts afresh by itself, as MuJoCo does, the episode is truncated, the
+        reward is 0 and ``info`` has ``simulation_diverged``.
+
         :param action: as in Gymnasium.
         :return: observation, reward, terminated, truncated and info.
         """
+        watches = self._stack.watches
+        for forget_the_past in watches:
+            forget_the_past()
         result = self.env.step(action)
         self.last_observation = private_copy(result[0])
+        for diverged in watches:
+            if diverged():
+                return diverged_step(result, self._stack.monitors)
         return result
 
     def snapshot(self) -> Snapshot:
@@ -115,7 +126,8 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
         """
         if not isinstance(snapshot, Snapshot):
             raise TypeError(f"Expected a Snapshot, got {type(snapshot).__name__}")
-        if not isinstance(rng, np.random.Generator) and rng not in ("restore", "keep"):
+        named = isinstance(rng, str) and rng in ("restore", "keep")
+        if not named and not isinstance(rng, np.random.Generator):
             raise ValueError(f'rng must be "restore", "keep" or a numpy.random.Generator, got {rng!r}')
         self._stack.check(snapshot.layers)
         for what, ours, its in zip(("observation", "action"), self._spaces, snapshot.spaces, strict=True):
