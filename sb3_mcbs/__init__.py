@@ -11,6 +11,7 @@ from sb3_mcbs.algorithms import (
     save_statistics,
 )
 from sb3_mcbs.algorithms.faults import NonFiniteError
+from sb3_mcbs.checkpoints import CheckpointError, ExactCheckpointCallback, resume
 from sb3_mcbs.models import WorkerError
 from sb3_mcbs.search import SearchSettings
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
@@ -23,6 +24,8 @@ except PackageNotFoundError:  # a checkout that was not installed
 __all__ = [
     "MCBSTD3",
     "AgentFileError",
+    "CheckpointError",
+    "ExactCheckpointCallback",
     "NonFiniteError",
     "SearchPolicy",
     "SearchSettings",
@@ -31,5 +34,6 @@ __all__ = [
     "__version__",
     "load_agent",
     "load_statistics",
+    "resume",
     "save_statistics",
 ]

@@ -359,6 +359,21 @@ class MCBSTD3(TD3):
                 total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
             )
 
+    @classmethod
+    def resume(cls: type[SelfMCBSTD3], path: str, env: GymEnv | None = None, **kwargs: Any) -> SelfMCBSTD3:
+        """
+        Continue a run from its exact checkpoints, see :func:`sb3_mcbs.resume`.
+
+        :param path: the folder of checkpoints
+        :param env: the environment, made as the original one was; None makes it from its id
+        :param kwargs: the other arguments of :func:`sb3_mcbs.resume`
+        :return: the agent
+        :raises CheckpointError: if there is no whole checkpoint, or it is of another class
+        """
+        from sb3_mcbs.checkpoints.resume import resume_as
+
+        return resume_as(cls, path, env, **kwargs)
+
     def predict(
         self,
         observation: np.ndarray | dict[str, np.ndarray],

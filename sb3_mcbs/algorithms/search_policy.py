@@ -49,6 +49,8 @@ class SearchPolicy:
         unknown = sorted(set(search_settings) - set(SearchSettings.names()))
         if unknown:
             raise TypeError(f"Unknown search settings {unknown}; known are {list(SearchSettings.names())}.")
+        if normalize_reward is not None and not isinstance(normalize_reward, bool):
+            raise TypeError(f"normalize_reward must be True, False or None, got {normalize_reward!r}.")
         settings = model.search_settings if isinstance(model, MCBSTD3) else SearchSettings()
         self.model = model
         self.settings = replace(settings, **search_settings)

@@ -140,6 +140,28 @@ class Searcher:
         self._previous_step_differed = error > 0
         return error
 
+    @property
+    def memory(self) -> dict[str, Any]:
+        """What was noticed about the environments, as plain values: part of exact checkpoints."""
+        model = self.model
+        return {
+            "kind": None if model is None else model.kind,
+            "deterministic": None if model is None else model.deterministic,
+            "previous_step_differed": self._previous_step_differed,
+        }
+
+    @memory.setter
+    def memory(self, memory: dict[str, Any]) -> None:
+        self._previous_step_differed = memory["previous_step_differed"]
+        if self.model is None:
+            return
+        if self.model.kind != memory["kind"]:
+            self.model.close()
+            self.model = make_forward_model(self.environments, memory["kind"], self.settings.n_threads)
+        elif self.model.kind != "pool":
+            self.model.refresh()  # the environments' simulators have other values than when it was made
+        self.model.deterministic = memory["deterministic"]
+
     def close(self) -> None:
         """Release the forward model."""
         if self.model is not None:

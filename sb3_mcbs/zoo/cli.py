@@ -5,6 +5,7 @@ import sys
 
 COMMANDS = {
     "train": ("sb3_mcbs.zoo.train", "train an agent: the arguments of python -m rl_zoo3.train"),
+    "resume": ("sb3_mcbs.zoo.resume", "continue a run from its exact checkpoints"),
     "repeat": ("sb3_mcbs.zoo.repeat", "repeat a run from its folder"),
     "report": ("sb3_mcbs.zoo.report", "returns and learning curve of a run's two policies"),
     "convert-statistics": ("sb3_mcbs.zoo.convert_statistics", "write a trusted vecnormalize.pkl as npz"),

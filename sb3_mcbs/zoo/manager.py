@@ -2,12 +2,18 @@
 
 import inspect
 from collections.abc import Callable
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 from rl_zoo3.exp_manager import ExperimentManager
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_mcbs.checkpoints import CheckpointError, ExactCheckpointCallback
+from sb3_mcbs.checkpoints.resume import continue_with
+from sb3_mcbs.checkpoints.resumption import Resumption
 from sb3_mcbs.search import SearchSettings
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 from sb3_mcbs.zoo.callbacks import SearchEvalCallback, SecondEvalCallback
@@ -18,6 +24,22 @@ from sb3_mcbs.zoo.registration import ALGORITHMS
 PACKAGE_CONFIG = "sb3_mcbs"
 #: Agents with a policy and critics that a search can be put on.
 SEARCHABLE = ("ddpg", "sac", "td3", "tqc")
+#: The folder of exact checkpoints within a run's folder.
+CHECKPOINTS = "checkpoints"
+
+
+class ResumedRun(NamedTuple):
+    """
+    A run that is continued instead of a new one.
+
+    :param folder: its folder
+    :param resumption: its newest checkpoint
+    :param log_folder: its folder for TensorBoard, if it has one
+    """
+
+    folder: Path
+    resumption: Resumption
+    log_folder: str | None
 
 
 class MCBSExperimentManager(ExperimentManager):
@@ -29,8 +51,13 @@ class MCBSExperimentManager(ExperimentManager):
     whose hyperparameters contain ``search_evaluation`` (a dictionary of search settings) is evaluated as it
     is in the run folder, and with search in the sibling folder ``ALGO_search``. All else is RL Zoo's.
 
+    An ``ExactCheckpointCallback`` without a path writes into the run's folder.
+
     The parameters are those of ``rl_zoo3.exp_manager.ExperimentManager``.
     """
+
+    #: Set by ``sb3-mcbs resume``, whose process makes one manager.
+    resumed_run: ResumedRun | None = None
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         arguments = inspect.signature(ExperimentManager.__init__).bind(self, *args, **kwargs).arguments
@@ -39,6 +66,22 @@ class MCBSExperimentManager(ExperimentManager):
         config = arguments.get("config")
         if config == PACKAGE_CONFIG or (config is None and self.algo in ALGORITHMS):
             self.config = str(hyperparams_path(self.algo))
+        if self.resumed_run is not None:
+            self.save_path = str(self.resumed_run.folder)
+            self.params_path = f"{self.save_path}/{self.env_name}"
+
+    def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
+        """
+        Set up the experiment as RL Zoo does, and put a resumed run's agent on its way.
+
+        :return: the agent and the hyperparameters; None when tuning
+        """
+        result = super().setup_experiment()
+        if result is not None and self.resumed_run is not None:
+            _, resumption, log_folder = self.resumed_run
+            assert isinstance(result[0], OffPolicyAlgorithm)
+            continue_with(result[0], resumption, log_folder)
+        return result
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """
@@ -63,6 +106,14 @@ class MCBSExperimentManager(ExperimentManager):
 
     def create_callbacks(self) -> None:
         """Create RL Zoo's callbacks, and the second evaluation just before the run's own."""
+        for callback in self.callbacks:
+            if isinstance(callback, ExactCheckpointCallback) and callback.path is None:
+                if self.optimize_hyperparameters:
+                    raise CheckpointError(
+                        "Trials have no folder for exact checkpoints. Remove the callback from the "
+                        "hyperparameters."
+                    )
+                callback.path = Path(self.save_path) / CHECKPOINTS
         super().create_callbacks()
         index = next((i for i, cb in enumerate(self.callbacks) if isinstance(cb, SearchEvalCallback)), None)
         if index is None or (self.algo not in ALGORITHMS and self.search_evaluation is None):

@@ -1,0 +1,226 @@
+"""``ExactCheckpointCallback``: checkpoints from which a run goes on as if it had never stopped."""
+
+import json
+import logging
+import os
+import signal
+import sys
+import warnings
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+from sb3_mcbs.checkpoints.buffers import added_rows, check_buffer, read_rows, rows_held
+from sb3_mcbs.checkpoints.errors import CheckpointError
+from sb3_mcbs.checkpoints.files import describe_format
+from sb3_mcbs.checkpoints.interrupts import Interrupts, TrainingInterrupted
+from sb3_mcbs.checkpoints.resumption import Resumption, pending
+from sb3_mcbs.checkpoints.settings import circumstances, describe_agent, describe_vec_env, inexact
+from sb3_mcbs.checkpoints.state import RunState
+from sb3_mcbs.checkpoints.store import Store
+from sb3_mcbs.snapshot import SnapshotUnsupportedError
+
+logger = logging.getLogger("sb3_mcbs")
+
+#: Says in the folder of checkpoints that a signal stopped the run.
+MARK = "interrupted.json"
+
+
+class ExactCheckpointCallback(BaseCallback):
+    """
+    Writes checkpoints from which :func:`sb3_mcbs.resume` goes on bit for bit as if nothing had happened.
+
+    A checkpoint is everything that decides the future: networks, optimizers, replay buffer, environments,
+    random generators, statistics, callbacks and log files. It is written between two rollouts, before the
+    first step and then every ``save_freq`` steps. Ctrl-C and SIGTERM stop training after a checkpoint; a
+    second signal stops at once.
+
+    Use it in the list of callbacks, not inside another callback::
+
+        agent.learn(100_000, callback=[ExactCheckpointCallback(10_000, "run/checkpoints"), EvalCallback(env)])
+
+    :param save_freq: environment steps between two checkpoints, of all environments together; rounded up to
+        the end of a rollout
+    :param path: a folder for this run's checkpoints alone; None: RL Zoo's run folder, in runs of RL Zoo
+    :param keep_last: how many checkpoints to keep. Two, so that there is a good one if the last is damaged
+    :param verbose: Verbosity level: 0 for no output, 1 for a line per checkpoint
+    """
+
+    #: Made anew when training begins.
+    not_checkpointed = ("store", "_run", "_interrupts", "_settings", "_vec_env", "_parts", "path")
+
+    def __init__(
+        self, save_freq: int, path: str | os.PathLike[str] | None = None, keep_last: int = 2, verbose: int = 0
+    ) -> None:
+        super().__init__(verbose)
+        for name, value in (("save_freq", save_freq), ("keep_last", keep_last)):
+            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+                raise ValueError(f"{name} must be an integer of 1 or more, got {value!r}.")
+        self.save_freq = save_freq
+        self.path = path
+        self.keep_last = keep_last
+        self._next_save = 0
+        self._rows_added = 0
+        self._position = 0
+        self._n_calls_then = 0
+        self._parts: list[dict[str, Any]] = []
+        self._run: RunState | None = None
+        self._interrupts = Interrupts(self._is_training)
+
+    def _init_callback(self) -> None:
+        self._check_place()
+        if not isinstance(self.model, OffPolicyAlgorithm):
+            raise CheckpointError(
+                f"{type(self.model).__name__} is not an off-policy algorithm; exact checkpoints are for "
+                "those."
+            )
+        if self.path is None:
+            raise CheckpointError(
+                "ExactCheckpointCallback needs a path: a folder for this run's checkpoints."
+            )
+        check_buffer(self.model.replay_buffer)
+        self.store = Store(self.path)
+        if self.store.steps() and pending(self.model) is None:
+            raise CheckpointError(
+                f"{self.path} holds the checkpoints of a run. Continue it with sb3_mcbs.resume, or choose "
+                "another folder."
+            )
+
+    def _check_place(self) -> None:
+        if self.parent is not None:
+            raise CheckpointError(
+                f"ExactCheckpointCallback is inside a {type(self.parent).__name__}, which does not say when "
+                "a rollout starts. Pass it to learn() itself, in a list with the others."
+            )
+
+    def _on_training_start(self) -> None:
+        self._check_place()
+
+    def _on_rollout_start(self) -> None:
+        assert isinstance(self.model, OffPolicyAlgorithm)
+        if self._run is None:
+            self._begin(self.model)
+        self._count_rows()
+        stopped_by = self._interrupts.received
+        if self.num_timesteps >= self._next_save or stopped_by is not None:
+            self._next_save = (self.num_timesteps // self.save_freq + 1) * self.save_freq
+            self._save_or_warn(first=not self.store.steps())
+        if stopped_by is not None:
+            self._stop(stopped_by)
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_training_end(self) -> None:
+        self._interrupts.end()
+        self._run = None
+
+    def _begin(self, agent: OffPolicyAlgorithm) -> None:
+        """Take stock of the run, once all of it is there, and continue a saved one if that is wanted."""
+        assert agent.env is not None and agent.replay_buffer is not None
+        root = self.locals["callback"]
+        self._run = RunState(agent, root)
+        self._settings = describe_agent(agent)
+        self._vec_env = describe_vec_env(agent.env)
+        self._position, self._rows_added = agent.replay_buffer.pos, rows_held(agent.replay_buffer)
+        self._n_calls_then, self._next_save, self._parts = self.n_calls, self.num_timesteps, []
+        resumption: Resumption | None = pending(agent)
+        if resumption is not None:
+            resumption.carry_out(agent, self._run, self._settings)
+            self._parts = resumption.checkpoint.manifest["rows"]
+            (self.store.folder / MARK).unlink(missing_ok=True)
+        self._interrupts.begin(self._run.worker_environments)
+
+    def _count_rows(self) -> None:
+        assert isinstance(self.model, OffPolicyAlgorithm) and self.model.replay_buffer is not None
+        buffer, steps = self.model.replay_buffer, self.n_calls - self._n_calls_then
+        self._rows_added += added_rows(buffer, self._position, steps)
+        self._position, self._n_calls_then = buffer.pos, self.n_calls
+
+    def _save_or_warn(self, first: bool) -> None:
+        try:
+            self._save()
+        except (OSError, CheckpointError, SnapshotUnsupportedError) as error:
+            if first and not isinstance(error, OSError):
+                raise  # better known before training than in the middle of it
+            message = (
+                f"No checkpoint could be written at {self.num_timesteps} steps: {error}. Training goes on; "
+                f"the last one in {self.path} is kept."
+            )
+            logger.warning(message)
+            warnings.warn(message, stacklevel=2)
+
+    def _save(self) -> None:
+        agent = self.model
+        assert isinstance(agent, OffPolicyAlgorithm) and agent.replay_buffer is not None
+        assert self._run is not None
+        captured = self._run.capture()
+        buffer = agent.replay_buffer
+        oldest = self._rows_added - rows_held(buffer)
+        parts = [part for part in self._parts if part["end"] >= oldest and part["end"] <= self._rows_added]
+        first = max([oldest, *(part["end"] for part in parts)])
+        if first < self._rows_added:
+            rows = read_rows(buffer, first, self._rows_added)
+            parts.append(self.store.write_rows(first, self._rows_added, rows))
+        manifest = {**self._describe(agent), "rows": parts}
+        arrays = {**captured.arrays, **{f"settings|{k}": v for k, v in self._settings.arrays.items()}}
+        self.store.write(self.num_timesteps, manifest, captured.json, arrays)
+        self._parts = parts
+        self.store.clean(self.keep_last)
+        if self.verbose >= 1:
+            print(f"Exact checkpoint at {self.num_timesteps} steps in {self.path}")
+
+    def _describe(self, agent: OffPolicyAlgorithm) -> dict[str, Any]:
+        assert self._run is not None
+        return {
+            "num_timesteps": agent.num_timesteps,
+            "num_timesteps_at_start": agent._num_timesteps_at_start,
+            "total_timesteps": agent._total_timesteps,
+            "settings": self._settings.json,
+            "environment": self._vec_env,
+            "parts": self._run.class_names,
+            "logger": [agent.logger.dir, [describe_format(each) for each in agent.logger.output_formats]],
+            "circumstances": circumstances(agent),
+            "inexact": inexact(agent),
+        }
+
+    def _stop(self, signum: int) -> None:
+        mark = {"signal": signal.Signals(signum).name, "num_timesteps": self.num_timesteps}
+        try:
+            (self.store.folder / MARK).write_text(json.dumps(mark) + "\n")
+        except OSError as error:
+            logger.warning("The folder could not be marked as interrupted: %s", error)
+        self._interrupts.end()
+        print(f"Stopped by {mark['signal']} at {self.num_timesteps} steps.", file=sys.stderr)
+        raise TrainingInterrupted(signum)
+
+    def _is_training(self, frame: FrameType | None) -> bool:
+        while frame is not None:
+            if frame.f_code.co_name == "learn" and frame.f_locals.get("self") is self.model:
+                return True
+            frame = frame.f_back
+        return False
+
+
+def find_in(callback: BaseCallback) -> ExactCheckpointCallback | None:
+    """Return the ``ExactCheckpointCallback`` of a run.
+
+    :param callback: the callback of its ``learn``.
+    """
+    if isinstance(callback, ExactCheckpointCallback):
+        return callback
+    if isinstance(callback, CallbackList):
+        return next((found for found in map(find_in, callback.callbacks) if found is not None), None)
+    return None
+
+
+def folder_of(path: str | os.PathLike[str]) -> Path:
+    """Return the folder of checkpoints that a path means: itself, or the one around a single checkpoint.
+
+    :param path: what the user gave.
+    """
+    path = Path(path)
+    return path.parent if path.name.startswith("step_") else path

@@ -1,0 +1,118 @@
+"""The files that a run writes line by line: Monitor's, and those of the logger."""
+
+import os
+import sys
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from stable_baselines3.common.logger import (
+    CSVOutputFormat,
+    HumanOutputFormat,
+    JSONOutputFormat,
+    KVWriter,
+    Logger,
+    TensorBoardOutputFormat,
+)
+
+from sb3_mcbs.checkpoints.errors import CheckpointError
+
+_FILE_FORMATS: dict[str, Any] = {"log": HumanOutputFormat, "json": JSONOutputFormat, "csv": CSVOutputFormat}
+_SUFFIXES = {"log": (".txt", ".log"), "json": (".json", ".jsonl"), "csv": (".csv",)}
+
+
+def read_written(handle: Any) -> np.ndarray:
+    """Return what a file that is open for writing holds so far.
+
+    :param handle: the open file.
+    :return: its bytes, ``[size]`` uint8.
+    """
+    handle.flush()
+    return np.fromfile(handle.name, np.uint8)
+
+
+def write_again(handle: Any, content: np.ndarray) -> None:
+    """Make a file that is open for writing hold what it held, and go on from there.
+
+    :param handle: the open file.
+    :param content: from :func:`read_written`.
+    """
+    handle.seek(0)
+    handle.truncate()
+    handle.write(content.tobytes().decode(handle.encoding))
+    handle.flush()
+
+
+def describe_format(output_format: Any) -> tuple[str, str | None]:
+    """Say what an output format of the logger writes.
+
+    :param output_format: one of SB3's.
+    :return: its kind, and the file or folder.
+    :raises CheckpointError: if it is of another class.
+    """
+    if type(output_format) is TensorBoardOutputFormat:
+        return "tensorboard", os.path.abspath(output_format.writer.log_dir)
+    for kind, cls in _FILE_FORMATS.items():
+        if type(output_format) is cls:
+            if kind == "log" and not output_format.own_file:
+                return "stdout", None
+            return kind, os.path.abspath(output_format.file.name)
+    raise CheckpointError(
+        f"The logger writes to a {type(output_format).__name__}, whose position in its output is not known. "
+        "Use SB3's output formats."
+    )
+
+
+def file_of(output_format: Any) -> IO[Any] | None:
+    """Return the file that an output format writes line by line, if it does.
+
+    :param output_format: one of SB3's.
+    """
+    kind, path = describe_format(output_format)
+    return output_format.file if path is not None and kind != "tensorboard" else None
+
+
+def make_logger(
+    folder: str | None, formats: list[tuple[str, str | None]], purge_step: int, roots: list[Path]
+) -> Logger:
+    """Make a logger that goes on where another one was.
+
+    :param folder: the logger's folder.
+    :param formats: from :func:`describe_format`.
+    :param purge_step: TensorBoard forgets what was logged at this step and later.
+    :param roots: folders that files may be in.
+    :raises CheckpointError: if a file is in none of them.
+    """
+    return Logger(folder, [_make_format(kind, path, purge_step, roots) for kind, path in formats])
+
+
+def _make_format(kind: str, path: str | None, purge_step: int, roots: list[Path]) -> KVWriter:
+    if kind == "stdout" or path is None:
+        return HumanOutputFormat(sys.stdout)
+    check_below(path, roots)
+    if kind == "tensorboard":
+        output_format = TensorBoardOutputFormat.__new__(TensorBoardOutputFormat)
+        from torch.utils.tensorboard import SummaryWriter
+
+        output_format.writer = SummaryWriter(log_dir=path, purge_step=purge_step)
+        output_format._is_closed = False
+        return output_format
+    if kind not in _FILE_FORMATS or not path.endswith(_SUFFIXES[kind]):
+        raise CheckpointError(f"The checkpoint names {path!r} as a log file of kind {kind!r}.")
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    return _FILE_FORMATS[kind](path)
+
+
+def check_below(path: str, roots: list[Path]) -> None:
+    """Refuse a file elsewhere: a checkpoint from a stranger could name any.
+
+    :param path: where a run wrote to.
+    :param roots: folders that it may be in.
+    :raises CheckpointError: if it is in none of them.
+    """
+    resolved = Path(path).resolve()
+    if not any(resolved.is_relative_to(root.resolve()) for root in roots):
+        raise CheckpointError(
+            f"The run logged to {resolved}, which is neither below the present folder nor beside its "
+            "checkpoints. If you want it to go on writing there, pass log_folder= with a folder above it."
+        )

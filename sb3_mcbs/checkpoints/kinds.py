@@ -1,0 +1,143 @@
+"""The kinds of objects that an agent and its callbacks hold besides those of environments."""
+
+from typing import Any
+
+import numpy as np
+import torch as th
+
+from sb3_mcbs.checkpoints.encoding import codec_of
+from sb3_mcbs.snapshot import SnapshotMismatchError, SnapshotUnsupportedError
+from sb3_mcbs.snapshot.arrays import ArrayKind
+from sb3_mcbs.snapshot.graph import Copier, Freezer, Kind, Thawer, class_name
+from sb3_mcbs.snapshot.kinds import KINDS as ENVIRONMENT_KINDS
+from sb3_mcbs.snapshot.kinds import kind_of as environment_kind_of
+
+
+class _NotCopied:
+    """The part of a kind that checkpoints never use."""
+
+    def copy(self, copier: Copier, obj: Any) -> Any:
+        raise NotImplementedError("agents are not copied")
+
+
+class OwnedArrayKind(ArrayKind):
+    """NumPy arrays. Those in a tensor's memory are put back with memory of their own."""
+
+    def freeze(self, freezer: Freezer, obj: np.ndarray) -> Any:
+        form, *rest = super().freeze(freezer, obj)
+        return ("own" if form == "borrowed" else form, *rest)
+
+
+class TensorKind(_NotCopied):
+    """Tensors: put back in place where there is one of the same shape."""
+
+    name = "tensor"
+
+    def freeze(self, freezer: Freezer, obj: th.Tensor) -> Any:
+        try:
+            content = obj.detach().cpu().numpy().copy()
+        except TypeError as error:
+            raise SnapshotUnsupportedError(f"it is a tensor that NumPy cannot hold: {error}") from error
+        return content, str(obj.device), obj.requires_grad and obj.is_leaf
+
+    def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
+        content, device, requires_grad = payload
+        saved = th.from_numpy(np.ascontiguousarray(content).reshape(content.shape))
+        same = isinstance(current, th.Tensor) and current.is_leaf and current.shape == saved.shape
+        if same and current.dtype == saved.dtype and thawer.claim(current):
+            thawer.do_then(_copy_into, current, saved)
+            return current
+        return saved.to(device).requires_grad_(requires_grad)
+
+
+def _copy_into(tensor: th.Tensor, saved: th.Tensor) -> None:
+    with th.no_grad():
+        tensor.copy_(saved)
+
+
+class OptimizerKind(_NotCopied):
+    """Optimisers: what their ``state_dict`` says."""
+
+    name = "optimizer"
+
+    def freeze(self, freezer: Freezer, obj: th.optim.Optimizer) -> Any:
+        return freezer.freeze(obj.state_dict())
+
+    def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
+        thawer.do_then(current.load_state_dict, thawer.thaw(payload))
+        return current
+
+
+class NamedTupleKind(_NotCopied):
+    """Named tuples."""
+
+    name = "namedtuple"
+
+    def freeze(self, freezer: Freezer, obj: Any) -> Any:
+        return type(obj), tuple(freezer.freeze(item) for item in obj)
+
+    def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
+        cls, items = payload
+        return tuple.__new__(cls, [thawer.thaw(item) for item in items])
+
+
+class NetworkKind(_NotCopied):
+    """Networks: those of the policy are components of the run, and never frozen themselves."""
+
+    name = "network"
+
+    def freeze(self, freezer: Freezer, obj: th.nn.Module) -> Any:
+        raise SnapshotUnsupportedError(f"it is a network ({class_name(type(obj))}) outside of the policy")
+
+    def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
+        raise SnapshotMismatchError("the checkpoint holds a network outside of the policy")
+
+
+class RegisteredKind(_NotCopied):
+    """Objects whose class registered a pair of functions."""
+
+    name = "registered"
+
+    def freeze(self, freezer: Freezer, obj: Any) -> Any:
+        # The encoder asks the class, and so does the decoder.
+        return (obj,)
+
+    def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
+        return payload[0]
+
+
+_OWN: dict[str, Kind] = {
+    kind.name: kind
+    for kind in (
+        OwnedArrayKind(),
+        TensorKind(),
+        OptimizerKind(),
+        NamedTupleKind(),
+        NetworkKind(),
+        RegisteredKind(),
+    )
+}
+KINDS: dict[str, Kind] = {**ENVIRONMENT_KINDS, **_OWN}
+
+
+def kind_of(obj: Any) -> Kind | None:
+    """Return the kind of an object; None if it never changes.
+
+    :param obj: any object that an agent, a callback or a logger holds.
+    """
+    cls = type(obj)
+    if cls is np.ndarray:
+        return _OWN["array"]
+    if isinstance(obj, th.Tensor):
+        return _OWN["tensor"]
+    if isinstance(obj, th.optim.Optimizer):
+        return _OWN["optimizer"]
+    if isinstance(obj, th.distributions.Distribution):
+        return KINDS["constant"]  # made anew from the networks whenever it is needed
+    if codec_of(cls) is not None:
+        return _OWN["registered"]
+    if issubclass(cls, tuple) and hasattr(cls, "_fields"):
+        return _OWN["namedtuple"]
+    if isinstance(obj, th.nn.Module):
+        return _OWN["network"]
+    return environment_kind_of(obj)

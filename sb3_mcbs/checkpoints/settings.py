@@ -1,0 +1,223 @@
+"""How an agent and its environments were made, as data, and how to make them again."""
+
+import inspect
+import platform
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.buffers import NStepReplayBuffer
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    SubprocVecEnv,
+    VecEnv,
+    VecMonitor,
+    VecNormalize,
+    VecTransposeImage,
+)
+
+from sb3_mcbs.algorithms.vec_env_view import snapshot_environments
+from sb3_mcbs.checkpoints.components import layers_of
+from sb3_mcbs.checkpoints.encoding import Decoder, Encoded, Encoder, name_of
+from sb3_mcbs.checkpoints.environments import describe_environment, make_environment
+from sb3_mcbs.checkpoints.errors import CheckpointError
+from sb3_mcbs.checkpoints.kinds import KINDS, kind_of
+from sb3_mcbs.snapshot import SnapshotUnsupportedError
+from sb3_mcbs.snapshot.graph import Freezer, Thawer
+
+#: Parameters of constructors that are kept under another name.
+_ATTRIBUTES = {"policy": "policy_class", "stats_window_size": "_stats_window_size"}
+_NOT_SETTINGS = ("self", "env", "_init_setup_model")
+_VEC_ENVS = {"DummyVecEnv": DummyVecEnv, "SubprocVecEnv": SubprocVecEnv}
+_NORMALIZE = (
+    "training", "norm_obs", "norm_reward", "clip_obs", "clip_reward", "gamma", "epsilon", "norm_obs_keys",
+)  # fmt: skip
+
+
+def describe_agent(agent: OffPolicyAlgorithm) -> Encoded:
+    """Read the settings that an agent was made with.
+
+    :param agent: the agent.
+    :return: the class's name and its constructor's arguments.
+    :raises CheckpointError: if one cannot be written as data; names it.
+    """
+    encoder, freezer = Encoder(), Freezer(kind_of, {}, 0)
+    settings = {}
+    for parameter in inspect.signature(type(agent).__init__).parameters.values():
+        if parameter.name in _NOT_SETTINGS or parameter.kind is parameter.VAR_KEYWORD:
+            continue
+        attribute = _ATTRIBUTES.get(parameter.name, parameter.name)
+        if not hasattr(agent, attribute):
+            raise CheckpointError(
+                f"{type(agent).__name__} keeps no attribute {attribute!r} for its parameter, so it could "
+                "not be "
+                "made again. Keep it."
+            )
+        value = getattr(agent, attribute)
+        if value is NStepReplayBuffer and agent.n_steps > 1:
+            value = None  # SB3 chose it by itself, and warns where it is given
+        if isinstance(value, np.generic):
+            value = value.item()  # as which SB3 keeps what it is given
+        try:
+            settings[parameter.name] = freezer.freeze(value)
+        except SnapshotUnsupportedError as error:
+            raise CheckpointError(
+                f"{parameter.name} cannot be part of a checkpoint: {error.reason}."
+            ) from error
+    for kind, payload in freezer.nodes:
+        if kind == "function" and (payload[1] or "<" in payload[0].qualname):
+            raise CheckpointError(
+                f"The settings hold the function {payload[0].qualname}, which cannot be written as data. For "
+                "a learning rate use SB3's LinearSchedule; else define it at the top of a module."
+            )
+    data = {
+        "class": name_of(type(agent)),
+        "settings": {name: encoder.encode(value) for name, value in settings.items()},
+        "nodes": encoder.encode_nodes(tuple(freezer.nodes)),
+    }
+    return Encoded(data, encoder.arrays)
+
+
+def make_agent(encoded: Encoded, names: dict[str, Any], env: GymEnv) -> OffPolicyAlgorithm:
+    """Make an agent as it was made.
+
+    :param encoded: from :func:`describe_agent`.
+    :param names: classes and functions that the checkpoint may name.
+    :param env: its environment.
+    """
+    decoder = Decoder(encoded.arrays, names)
+    cls = decoder.decode({"name": encoded.json["class"]})
+    if not (isinstance(cls, type) and issubclass(cls, OffPolicyAlgorithm)):
+        raise CheckpointError(f"The checkpoint names {cls!r} as the class of its agent.")
+    thawer = Thawer(decoder.decode_nodes(encoded.json["nodes"]), KINDS, [], "restore")
+    settings = {name: thawer.thaw(decoder.decode(value)) for name, value in encoded.json["settings"].items()}
+    thawer.commit()
+    return cls(env=env, **settings)
+
+
+def describe_vec_env(vec_env: VecEnv) -> dict[str, Any] | None:
+    """Say how to make a vectorized environment like this one.
+
+    :param vec_env: the agent's environment; environments in this process are wrapped for snapshots.
+    :return: None if ids and plain arguments are not all that it takes.
+    """
+    *wrappers, base = layers_of(vec_env)
+    if type(base).__name__ not in _VEC_ENVS or type(base) not in _VEC_ENVS.values():
+        return None
+    layers: list[list[Any]] = []
+    for layer in reversed(wrappers):
+        if type(layer) is VecNormalize:
+            layers.append(["VecNormalize", {name: getattr(layer, name) for name in _NORMALIZE}])
+        elif type(layer) is VecMonitor:
+            writer = layer.results_writer
+            filename = None if writer is None else writer.file_handler.name
+            layers.append(["VecMonitor", {"filename": filename, "info_keywords": list(layer.info_keywords)}])
+        elif type(layer) is not VecTransposeImage:  # which SB3 adds by itself
+            return None
+    environments = snapshot_environments(base)
+    described = environments.apply(range(len(environments)), describe_environment)
+    if any(description is None for description in described):
+        return None
+    return {"class": type(base).__name__, "environments": described, "layers": layers}
+
+
+def make_vec_env(description: dict[str, Any]) -> VecEnv:
+    """Make a vectorized environment as it was made.
+
+    :param description: from :func:`describe_vec_env`.
+    """
+    makers = [_Maker(environment) for environment in description["environments"]]
+    vec_env: VecEnv = _VEC_ENVS[description["class"]](makers)
+    for name, arguments in description["layers"]:
+        if name == "VecNormalize":
+            vec_env = VecNormalize(vec_env, **arguments)
+        else:
+            keywords = tuple(arguments["info_keywords"])
+            vec_env = VecMonitor(vec_env, arguments["filename"], keywords)
+    return vec_env
+
+
+class _Maker:
+    """Makes one environment, in a worker too."""
+
+    def __init__(self, description: dict[str, Any]) -> None:
+        self._description = description
+
+    def __call__(self) -> Any:
+        return make_environment(self._description)
+
+
+def log_files(description: dict[str, Any]) -> list[str]:
+    """Return the files that a vectorized environment would write.
+
+    :param description: from :func:`describe_vec_env`.
+    """
+    monitors = [environment["monitor"] for environment in description["environments"]]
+    names = [monitor["filename"] for monitor in monitors if monitor is not None]
+    names += [arguments["filename"] for name, arguments in description["layers"] if name == "VecMonitor"]
+    return [name for name in names if name is not None]
+
+
+def circumstances(agent: OffPolicyAlgorithm) -> dict[str, Any]:
+    """Return what has to be equal for a resumed run to be exact.
+
+    :param agent: the agent.
+    """
+    packages = ("numpy", "torch", "gymnasium", "stable-baselines3", "sb3-contrib", "mujoco", "sb3-mcbs")
+    return {
+        "device": str(agent.device),
+        "torch threads": th.get_num_threads(),
+        "float32 matrix products": th.get_float32_matmul_precision(),
+        "processor": f"{platform.machine()} {th.backends.cpu.get_cpu_capability()}",
+        "python": platform.python_version(),
+        **{package: _version(package) for package in packages},
+    }
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except ImportError:
+        return None
+
+
+def inexact(agent: OffPolicyAlgorithm) -> list[str]:
+    """Return why a run cannot be repeated to the bit, whatever is saved.
+
+    :param agent: the agent.
+    """
+    reasons = []
+    if getattr(agent, "time_budget", None) is not None:
+        reasons.append("time_budget makes decisions depend on how fast the machine is")
+    if agent.device.type != "cpu":
+        reasons.append(f"on {agent.device} networks are not computed in a fixed order")
+    return reasons
+
+
+def check_settings(settings: Encoded, ours: Encoded) -> None:
+    """Refuse to continue a run with an agent that was made with other settings.
+
+    :param settings: those of the checkpoint.
+    :param ours: the agent's own.
+    :raises CheckpointError: names the settings that differ.
+    """
+    theirs_json, ours_json = settings.json, ours.json
+    if theirs_json["class"] != ours_json["class"]:
+        raise CheckpointError(
+            f"The checkpoint is of a {theirs_json['class']}, the agent is a {ours_json['class']}."
+        )
+    if theirs_json == ours_json and all(
+        name in ours.arrays and np.array_equal(array, ours.arrays[name])
+        for name, array in settings.arrays.items()
+    ):
+        return
+    names = sorted(
+        name
+        for name in theirs_json["settings"].keys() | ours_json["settings"].keys()
+        if theirs_json["settings"].get(name) != ours_json["settings"].get(name)
+    )
+    what = ", ".join(names) if names else "the content of its settings"
+    raise CheckpointError(f"The agent was made with other settings than the run of the checkpoint: {what}.")

@@ -1,0 +1,341 @@
+"""Checkpoints on disk: written beside, flushed, renamed; checked by size and SHA-256 when read.
+
+A folder of checkpoints holds ``step_N`` for every checkpoint that is kept, each with a manifest, and
+``rows`` with the replay buffer's rows in files that several checkpoints share.
+"""
+
+import hashlib
+import io
+import json
+import os
+import shutil
+import zipfile
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
+
+import numpy as np
+
+from sb3_mcbs.checkpoints.encoding import dumps
+from sb3_mcbs.checkpoints.errors import CheckpointError
+
+FORMAT = 1
+MANIFEST, STATE, ARRAYS, ROWS = "manifest.json", "state.json", "arrays.npz", "rows"
+_UNFINISHED = ".unfinished-"
+_PREFIX = "step_"
+#: More than any manifest needs: a file from a stranger is not read without a limit.
+_MAX_MANIFEST = 16 * 2**20
+
+
+class FileSeal(NamedTuple):
+    """What a file must be.
+
+    :param size: in bytes.
+    :param sha256: of its content.
+    """
+
+    size: int
+    sha256: str
+
+
+class Checkpoint(NamedTuple):
+    """A checkpoint that was read and found whole, all but the replay buffer's rows.
+
+    :param folder: where it is.
+    :param manifest: what it says about itself.
+    :param state: the state as JSON.
+    :param arrays: the state's arrays, by section and dtype.
+    """
+
+    folder: Path
+    manifest: dict[str, Any]
+    state: Any
+    arrays: dict[str, np.ndarray]
+
+
+class _Sealing(io.BufferedIOBase):
+    """A file for writing that computes its seal on the way."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        super().__init__()
+        self._file = file
+        self._digest = hashlib.sha256()
+        self._size = 0
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, data: Any) -> int:
+        self._digest.update(data)
+        self._size += memoryview(data).nbytes
+        return self._file.write(data)
+
+    def flush(self) -> None:
+        self._file.flush()
+
+    @property
+    def seal(self) -> FileSeal:
+        return FileSeal(self._size, self._digest.hexdigest())
+
+
+def write_file(path: Path, write: Callable[[Any], Any]) -> FileSeal:
+    """Write a file and have it on the disk when this returns.
+
+    :param path: the file.
+    :param write: called with an open file that cannot be sought in.
+    """
+    with open(path, "wb") as file:
+        sealing = _Sealing(file)
+        write(sealing)
+        file.flush()
+        os.fsync(file.fileno())
+    return sealing.seal
+
+
+def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> FileSeal:
+    """Write arrays as an uncompressed npz.
+
+    :param path: the file.
+    :param arrays: without objects.
+    """
+    return write_file(path, lambda file: np.savez(file, allow_pickle=False, **arrays))
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """Read an npz that :func:`write_arrays` wrote.
+
+    :param path: the file.
+    :raises CheckpointError: if it is something else.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if any(member.compress_type != zipfile.ZIP_STORED for member in archive.infolist()):
+                raise CheckpointError(f"{path} is compressed, which no checkpoint is.")
+        with np.load(path, allow_pickle=False) as loaded:
+            return {name: loaded[name] for name in loaded.files}
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise CheckpointError(f"{path} cannot be read: {error}") from error
+
+
+def sync_folder(folder: Path) -> None:
+    """Have the names of a folder's files on the disk."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+class Store:
+    """A folder of checkpoints.
+
+    :param folder: the folder.
+    """
+
+    def __init__(self, folder: str | os.PathLike[str]) -> None:
+        self.folder = Path(folder)
+        self.rows_folder = self.folder / ROWS
+
+    def steps(self) -> list[int]:
+        """Return the environment steps at which there are checkpoints, newest first."""
+        names = [path.name for path in self.folder.glob(_PREFIX + "*")] if self.folder.is_dir() else []
+        numbers = [name.removeprefix(_PREFIX) for name in names]
+        return sorted((int(number) for number in numbers if number.isdecimal()), reverse=True)
+
+    def path_of(self, step: int) -> Path:
+        """Return the folder of a checkpoint.
+
+        :param step: environment steps.
+        """
+        return self.folder / f"{_PREFIX}{step:012d}"
+
+    def write_rows(self, first: int, end: int, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
+        """Write rows of the replay buffer.
+
+        :param first: number of the first row, counted since the beginning.
+        :param end: one more than the number of the last row.
+        :param arrays: the rows.
+        :return: how a manifest refers to the file.
+        """
+        self.rows_folder.mkdir(parents=True, exist_ok=True)
+        name = f"{first:012d}-{end:012d}.npz"
+        unfinished = self.rows_folder / (_UNFINISHED + name)
+        with _removed_if_it_fails(unfinished):
+            seal = write_arrays(unfinished, arrays)
+        os.replace(unfinished, self.rows_folder / name)
+        sync_folder(self.rows_folder)
+        return {"name": name, "first": first, "end": end, "seal": list(seal)}
+
+    def write(
+        self, step: int, manifest: dict[str, Any], state: Any, arrays: Mapping[str, np.ndarray]
+    ) -> None:
+        """Write a checkpoint; it appears whole or not at all.
+
+        :param step: environment steps.
+        :param manifest: what it says about itself; the seals of its files are added.
+        :param state: the state as JSON.
+        :param arrays: the state's arrays.
+        """
+        final = self.path_of(step)
+        unfinished = self.folder / (_UNFINISHED + final.name)
+        _remove(unfinished)
+        with _removed_if_it_fails(unfinished):
+            unfinished.mkdir(parents=True)
+            seals = {
+                STATE: write_file(unfinished / STATE, lambda file: file.write(dumps(state))),
+                ARRAYS: write_arrays(unfinished / ARRAYS, arrays),
+            }
+            files = {name: list(seal) for name, seal in seals.items()}
+            sealed = seal_manifest({**manifest, "files": files})
+            write_file(unfinished / MANIFEST, lambda file: file.write(dumps(sealed)))
+            sync_folder(unfinished)
+        if final.exists():  # a damaged one that a resumed run has passed again
+            _remove(final)
+        os.rename(unfinished, final)
+        sync_folder(self.folder)
+
+    def clean(self, keep_last: int) -> None:
+        """Remove what no kept checkpoint needs.
+
+        :param keep_last: how many checkpoints to keep.
+        """
+        for step in self.steps()[keep_last:]:
+            _remove(self.path_of(step))
+        for unfinished in (*self.folder.glob(_UNFINISHED + "*"), *self.rows_folder.glob(_UNFINISHED + "*")):
+            _remove(unfinished)
+        needed = set()
+        for step in self.steps():
+            try:
+                needed |= {part["name"] for part in read_manifest(self.path_of(step))["rows"]}
+            except CheckpointError:
+                continue  # damaged; the next one replaces it
+        for path in self.rows_folder.glob("*.npz"):
+            if path.name not in needed:
+                path.unlink()
+
+    def read_rows(self, parts: list[dict[str, Any]]) -> list[dict[str, np.ndarray]]:
+        """Read rows of the replay buffer.
+
+        :param parts: how a manifest refers to them.
+        :raises CheckpointError: if a file is not what the manifest says.
+        """
+        return [read_arrays(self._rows_file(part)) for part in parts]
+
+    def _rows_file(self, part: dict[str, Any]) -> Path:
+        name = str(part["name"])
+        if Path(name).name != name:
+            raise CheckpointError(f"The checkpoint names {name!r} as a file with rows.")
+        return self.rows_folder / name
+
+    def read(self, step: int) -> Checkpoint:
+        """Read a checkpoint, and check that all its files are whole.
+
+        :param step: environment steps.
+        :raises CheckpointError: if one is missing, or not what the manifest says.
+        """
+        folder = self.path_of(step)
+        manifest = read_manifest(folder)
+        try:
+            for name in (STATE, ARRAYS):
+                check_seal(folder / name, FileSeal(*manifest["files"][name]))
+            for part in manifest["rows"]:
+                check_seal(self._rows_file(part), FileSeal(*part["seal"]))
+            state = json.loads((folder / STATE).read_bytes())
+        except (KeyError, TypeError, ValueError, RecursionError) as error:
+            raise CheckpointError(f"The files in {folder} are not a checkpoint: {error!r}") from error
+        return Checkpoint(folder, manifest, state, read_arrays(folder / ARRAYS))
+
+    def read_newest(self, warn: Callable[[str], None]) -> Checkpoint:
+        """Read the newest checkpoint that is whole.
+
+        :param warn: called with a message about every newer one that is not.
+        :raises CheckpointError: if there is none.
+        """
+        reasons = []
+        for step in self.steps():
+            try:
+                checkpoint = self.read(step)
+            except CheckpointError as error:
+                reasons.append(str(error))
+                continue
+            for reason in reasons:
+                warn(f"A damaged checkpoint is passed over: {reason} The one at {step} steps is used.")
+            return checkpoint
+        if reasons:
+            raise CheckpointError(f"No checkpoint in {self.folder} is whole. " + " ".join(reasons))
+        raise CheckpointError(f"There is no checkpoint in {self.folder}.")
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """Read what a checkpoint says about itself.
+
+    :param folder: the checkpoint.
+    :raises CheckpointError: if it is not there, not a manifest, or of another format.
+    """
+    path = folder / MANIFEST
+    try:
+        if path.stat().st_size > _MAX_MANIFEST:
+            raise CheckpointError(f"{path} is too large to be a manifest.")
+        manifest = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError) as error:
+        raise CheckpointError(f"{path} cannot be read: {error}.") from error
+    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
+        found = manifest.get("format") if isinstance(manifest, dict) else None
+        raise CheckpointError(
+            f"{path} is of format {found}, this version of sb3-mcbs reads format {FORMAT}. Resume with the "
+            "version that wrote it."
+        )
+    if manifest != seal_manifest(manifest.get("content")):
+        raise CheckpointError(f"The content of {path} is not what was written (SHA-256).")
+    return manifest["content"]
+
+
+def seal_manifest(content: Any) -> dict[str, Any]:
+    """Put what a manifest says together with its digest.
+
+    :param content: what it says.
+    """
+    return {"format": FORMAT, "sha256": hashlib.sha256(dumps(content)).hexdigest(), "content": content}
+
+
+def check_seal(path: Path, seal: FileSeal) -> None:
+    """Refuse a file that is not what was written.
+
+    :param path: the file.
+    :param seal: what it must be.
+    :raises CheckpointError: names the file and the difference.
+    """
+    try:
+        size = path.stat().st_size
+        if size != seal.size:
+            raise CheckpointError(f"{path} has {size} bytes instead of {seal.size}.")
+        with open(path, "rb") as file:
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise CheckpointError(f"{path} cannot be read: {error}.") from error
+    if digest != seal.sha256:
+        raise CheckpointError(f"The content of {path} is not what was written (SHA-256).")
+
+
+@contextmanager
+def _removed_if_it_fails(path: Path) -> Iterator[None]:
+    """Leave nothing half written: on a full disk that room is needed."""
+    try:
+        yield
+    except BaseException:
+        _remove(path)
+        raise
+
+
+def _remove(path: Path) -> None:
+    """Remove a file or folder; a folder's name first, so that half of it is never taken for a checkpoint."""
+    if path.is_dir():
+        if not path.name.startswith(_UNFINISHED):
+            unfinished = path.with_name(_UNFINISHED + "old-" + path.name)
+            shutil.rmtree(unfinished, ignore_errors=True)
+            os.rename(path, unfinished)
+            path = unfinished
+        shutil.rmtree(path, ignore_errors=True)
+    elif path.exists():
+        path.unlink()

@@ -1,0 +1,40 @@
+"""``python -m sb3_mcbs.zoo.resume RUN_FOLDER``: continue an RL Zoo run from its exact checkpoints."""
+
+import argparse
+from pathlib import Path
+
+from sb3_mcbs.checkpoints.resume import read_resumption
+from sb3_mcbs.zoo.manager import CHECKPOINTS, MCBSExperimentManager, ResumedRun
+from sb3_mcbs.zoo.repeat import load_run, repeat
+
+
+def resume(run_folder: str | Path) -> None:
+    """
+    Continue a run in its own folder, to the end that it would have had.
+
+    :param run_folder: ``LOGS/ALGO/ENV_NUMBER``, of a run with an ``ExactCheckpointCallback``
+    :raises CheckpointError: if it has no checkpoint that is whole
+    """
+    folder = Path(run_folder).resolve()
+    _, args = load_run(folder)
+    resumption = read_resumption(folder / CHECKPOINTS)
+    MCBSExperimentManager.resumed_run = ResumedRun(folder, resumption, args.get("tensorboard_log") or None)
+    try:
+        repeat(folder)
+    finally:
+        MCBSExperimentManager.resumed_run = None
+
+
+def main() -> None:
+    """Read the command line and continue the run."""
+    parser = argparse.ArgumentParser(
+        prog="sb3-mcbs resume",
+        description="Continue an RL Zoo run that was stopped or killed. It must have been started with an "
+        "ExactCheckpointCallback: see the documentation of checkpoints.",
+    )
+    parser.add_argument("run_folder", help="the run's folder, for example logs/mcbs_td3/HalfCheetah-v5_1")
+    resume(parser.parse_args().run_folder)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,91 @@
+"""Ctrl-C, SIGTERM and SIGKILL, on whole runs in processes of their own."""
+
+import json
+import os
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.kill import differences, kill_once, run_killed, start, wait_until
+from benchmarks.kill_run import RESULT, STARTED
+from sb3_mcbs.checkpoints.store import Store
+
+WORKERS = "Pendulum-v1 in workers"
+ENDLESS = 1_000_000
+
+
+def start_and_wait(folder: Path, case: str, steps: int = ENDLESS, save_freq: int = 100):
+    process = start("mcbs_td3", case, folder, steps, save_freq)
+    assert wait_until((folder / STARTED).exists, process, 120), (folder / "output.txt").read_text()
+    return process
+
+
+def group_is_gone(group: int) -> bool:
+    end = time.monotonic() + 20
+    while time.monotonic() < end:
+        try:
+            os.killpg(group, 0)
+        except ProcessLookupError:
+            return True
+        time.sleep(0.05)
+    return False
+
+
+@pytest.mark.parametrize(("signum", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_to_the_whole_group_saves_and_stops(signum, status, tmp_path):
+    process = start_and_wait(tmp_path, WORKERS)
+    os.killpg(process.pid, signum)
+    assert process.wait(60) == status, (tmp_path / "output.txt").read_text()
+    assert group_is_gone(process.pid)
+    mark = json.loads((tmp_path / "checkpoints" / "interrupted.json").read_text())
+    assert mark["signal"] == signal.Signals(signum).name
+    newest = Store(tmp_path / "checkpoints").steps()[0]
+    assert newest == mark["num_timesteps"]
+    Store(tmp_path / "checkpoints").read(newest)
+    output = (tmp_path / "output.txt").read_text()
+    assert "Traceback" not in output
+    assert f"Stopped by {mark['signal']} at {newest} steps" in output
+
+
+def test_a_second_signal_stops_at_once(tmp_path):
+    # One rollout is far longer than the test, so the first signal has to wait for its end.
+    process = start("td3_one_rollout", "Pendulum-v1", tmp_path, ENDLESS, ENDLESS)
+    assert wait_until((tmp_path / STARTED).exists, process, 120), (tmp_path / "output.txt").read_text()
+    os.kill(process.pid, signal.SIGINT)
+    assert wait_until(
+        lambda: "Once more to stop at once" in (tmp_path / "output.txt").read_text(), process, 20
+    )
+    time.sleep(0.5)
+    assert process.poll() is None
+    os.kill(process.pid, signal.SIGINT)
+    assert process.wait(20) != 130
+    assert "KeyboardInterrupt" in (tmp_path / "output.txt").read_text()
+
+
+def test_killed_while_writing(tmp_path):
+    """The small version of ``make bench-kill``: one SIGKILL inside a checkpoint, against a whole run."""
+    whole = start("mcbs_td3", "Pendulum-v1", tmp_path / "whole", 600, 100)
+    process = start_and_wait(tmp_path / "killed", "Pendulum-v1", 600)
+    assert kill_once(process, tmp_path / "killed", True, 0.3) is not None
+    assert start("mcbs_td3", "Pendulum-v1", tmp_path / "killed", 600, 100).wait(120) == 0
+    assert whole.wait(120) == 0
+    assert differences(tmp_path / "whole", tmp_path / "killed") == []
+    assert len(np.load(tmp_path / "whole" / RESULT).files) > 50
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("algorithm", ["mcbs_td3", "td3", "sac"])
+def test_killed_and_stopped_again_and_again(algorithm, tmp_path):
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    assert start(algorithm, WORKERS, whole, 3000, 100).wait(300) == 0
+    process = start(algorithm, WORKERS, killed, 3000, 100)
+    assert wait_until((killed / STARTED).exists, process, 120)
+    os.killpg(process.pid, signal.SIGINT)
+    assert process.wait(60) == 130
+    hits = run_killed(algorithm, WORKERS, killed, 3000, 100, 4, np.random.default_rng(0))
+    assert hits
+    assert differences(whole, killed) == []
+    assert not (killed / "checkpoints" / "interrupted.json").exists()
