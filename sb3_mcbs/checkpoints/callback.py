@@ -50,7 +50,15 @@ class ExactCheckpointCallback(BaseCallback):
     """
 
     #: Made anew when training begins.
-    not_checkpointed = ("store", "_run", "_interrupts", "_settings", "_vec_env", "_parts", "path")
+    not_checkpointed: tuple[str, ...] = (
+        "store",
+        "_run",
+        "_interrupts",
+        "_settings",
+        "_vec_env",
+        "_parts",
+        "path",
+    )
 
     def __init__(
         self, save_freq: int, path: str | os.PathLike[str] | None = None, keep_last: int = 2, verbose: int = 0
