@@ -4,7 +4,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.sb3-mcbs-installed
 
 .PHONY: help install train test test-slow lint format evidence clean
-.PHONY: bench-search bench-training bench-scaling bench-memory bench-deadline bench-gradient_step
+.PHONY: bench-search bench-training bench-scaling bench-memory bench-deadline bench-gradient_step bench-kill bench-soak
 
 help:
 	@echo "make train      set up $(VENV), train MCBS-TD3 on HalfCheetah-v5 for 20 000 steps, report"
@@ -12,7 +12,7 @@ help:
 	@echo "make test-slow  the tests that build packages or take long"
 	@echo "make lint       ruff and mypy"
 	@echo "make format     ruff format, and what ruff check can repair"
-	@echo "make bench-search and other measurements: see docs/speed.md"
+	@echo "make bench-search and other measurements: see docs/speed.md and docs/checkpoints.md"
 	@echo "make evidence   TD3 against MCBS-TD3, three seeds each (about an hour on two cores)"
 
 $(BIN)/python:
@@ -47,7 +47,7 @@ format: $(STAMP)
 evidence: $(STAMP)
 	$(BIN)/python benchmarks/first_evidence.py
 
-bench-search bench-scaling bench-memory bench-deadline bench-gradient_step: bench-%: $(STAMP)
+bench-search bench-scaling bench-memory bench-deadline bench-gradient_step bench-kill bench-soak: bench-%: $(STAMP)
 	$(BIN)/python -m benchmarks.$*
 
 # SBX (JAX) is a peer to be measured against; it is kept apart.

@@ -133,7 +133,7 @@ def measure(
     return {
         "algorithm": algorithm,
         "environment": case,
-        "environments": CASES[case][1],
+        "environments": CASES[case].n_envs,
         "steps": steps,
         "kills": len(hits),
         "while writing": hits.count("while writing"),

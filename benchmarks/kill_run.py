@@ -4,7 +4,7 @@ import argparse
 import glob
 import hashlib
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
@@ -15,16 +15,32 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecNormalize
 
+from benchmarks.common import NETWORKS
 from sb3_mcbs import MCBSTD3, SnapshotEnvWrapper
 from sb3_mcbs.checkpoints import ExactCheckpointCallback, resume
 
-#: environment, number of environments (more than one: in worker processes), whether normalised
+
+class Case(NamedTuple):
+    """What is trained on.
+
+    :param env_id: the environment.
+    :param n_envs: how many; more than one are in worker processes.
+    :param normalized: whether ``VecNormalize`` is around them.
+    :param zoo: whether networks and batches are those of RL Zoo, on two threads; else small, on one.
+    """
+
+    env_id: str
+    n_envs: int = 1
+    normalized: bool = False
+    zoo: bool = False
+
+
 CASES = {
-    "HalfCheetah-v5": ("HalfCheetah-v5", 1, False),
-    "Ant-v5": ("Ant-v5", 1, False),
-    "Walker2d-v5": ("Walker2d-v5", 4, True),
-    "Pendulum-v1": ("Pendulum-v1", 1, False),
-    "Pendulum-v1 in workers": ("Pendulum-v1", 4, True),
+    "HalfCheetah-v5": Case("HalfCheetah-v5", zoo=True),
+    "Ant-v5": Case("Ant-v5"),
+    "Walker2d-v5": Case("Walker2d-v5", 4, normalized=True),
+    "Pendulum-v1": Case("Pendulum-v1"),
+    "Pendulum-v1 in workers": Case("Pendulum-v1", 4, normalized=True),
 }
 ALGORITHMS: dict[str, tuple[type[OffPolicyAlgorithm], dict[str, Any]]] = {
     "mcbs_td3": (MCBSTD3, {"n_threads": 1}),
@@ -58,7 +74,7 @@ def make_env(case: str, folder: Path | None) -> VecEnv:
     :param case: a key of ``CASES``.
     :param folder: for Monitor's files; None makes one environment to evaluate in.
     """
-    env_id, n_envs, normalized = CASES[case]
+    env_id, n_envs, normalized, _ = CASES[case]
     if folder is None:
         vec_env: VecEnv = make_vec_env(env_id, 1, seed=1000)
     else:
@@ -86,8 +102,8 @@ def make_agent(algorithm: str, case: str, folder: Path) -> OffPolicyAlgorithm:
         make_env(case, folder),
         learning_starts=200,
         buffer_size=1500,  # wraps around
-        batch_size=64,
-        policy_kwargs={"net_arch": [64, 64]},
+        batch_size=256 if CASES[case].zoo else 64,
+        policy_kwargs=dict(NETWORKS) if CASES[case].zoo else {"net_arch": [64, 64]},
         seed=0,
         device="cpu",
         **settings,
@@ -105,7 +121,7 @@ def train(algorithm: str, case: str, folder: Path, steps: int, save_freq: int) -
     :param steps: environment steps in all.
     :param save_freq: environment steps between checkpoints.
     """
-    th.set_num_threads(1)
+    th.set_num_threads(2 if CASES[case].zoo else 1)
     folder.mkdir(parents=True, exist_ok=True)
     checkpoints = folder / "checkpoints"
     begun = any(checkpoints.glob("step_*"))

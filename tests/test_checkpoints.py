@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecFrameStack, VecMo
 
 from sb3_mcbs import MCBSTD3, ExactCheckpointCallback, SnapshotEnvWrapper, resume
 from sb3_mcbs.checkpoints import CheckpointError
-from tests.checkpoint_helpers import Crash, assert_resumed_is_exact, crash, learn
+from tests.checkpoint_helpers import Crash, assert_resumed_is_exact, assert_same_runs, crash, learn
 
 SMALL = dict(learning_starts=20, batch_size=16, seed=0, device="cpu")
 SEARCH = dict(beam_width=3, rollout_depth=2, n_simulations=2, n_threads=1)
@@ -217,6 +217,27 @@ def test_settings_are_those_of_the_run(tmp_path):
     assert (agent.beam_noise, agent.gamma, agent.beam_width) == (0.37, 0.9, 3)
 
 
+def test_learn_may_be_called_again(tmp_path):
+    """With the same callback, as long as steps are counted on."""
+    agent = RUNS["DDPG, large buffer"](tmp_path)
+    callback = ExactCheckpointCallback(40, tmp_path / "checkpoints")
+    agent.learn(100, callback=callback)
+    agent.learn(100, callback=callback, reset_num_timesteps=False)
+    resumed = resume(tmp_path / "checkpoints")
+    resumed.learn(
+        100, callback=ExactCheckpointCallback(40, tmp_path / "checkpoints"), reset_num_timesteps=False
+    )
+    assert_same_runs(agent, resumed)
+    with pytest.raises(CheckpointError, match="holds the checkpoints of a run"):
+        agent.learn(100, callback=callback)
+
+
+def test_resume_of_another_class(tmp_path):
+    crash(RUNS["DDPG, large buffer"], tmp_path, 150, 105)
+    with pytest.raises(CheckpointError, match="of a DDPG, not of a MCBSTD3"):
+        MCBSTD3.resume(tmp_path / "checkpoints")
+
+
 class OwnExtractor(FlattenExtractor):
     """A class that no checkpoint may name unless the caller does."""
 
@@ -293,7 +314,7 @@ class TestRefused:
     def test_state_that_is_no_data(self, tmp_path):
         agent = RUNS["DDPG, large buffer"](tmp_path)
         agent.my_file = open(tmp_path / "file", "w")  # noqa: SIM115
-        with pytest.raises(CheckpointError, match=r"DDPG\.my_file.*open file"):
+        with pytest.raises(CheckpointError, match=r"DDPG\.my_file.*TextIOWrapper"):
             learn(agent, tmp_path, 150)
         agent.my_file.close()
 

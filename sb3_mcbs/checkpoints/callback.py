@@ -57,6 +57,7 @@ class ExactCheckpointCallback(BaseCallback):
         "_settings",
         "_vec_env",
         "_parts",
+        "_begun",
         "path",
     )
 
@@ -75,6 +76,7 @@ class ExactCheckpointCallback(BaseCallback):
         self._position = 0
         self._n_calls_then = 0
         self._parts: list[dict[str, Any]] = []
+        self._begun = False
         self._run: RunState | None = None
         self._interrupts = Interrupts(self._is_training)
 
@@ -91,7 +93,9 @@ class ExactCheckpointCallback(BaseCallback):
             )
         check_buffer(self.model.replay_buffer)
         self.store = Store(self.path)
-        if self.store.steps() and pending(self.model) is None:
+        newest = max(self.store.steps(), default=None)
+        goes_on = self._begun and newest is not None and newest <= self.model.num_timesteps
+        if newest is not None and pending(self.model) is None and not goes_on:
             raise CheckpointError(
                 f"{self.path} holds the checkpoints of a run. Continue it with sb3_mcbs.resume, or choose "
                 "another folder."
@@ -130,7 +134,7 @@ class ExactCheckpointCallback(BaseCallback):
         """Take stock of the run, once all of it is there, and continue a saved one if that is wanted."""
         assert agent.env is not None and agent.replay_buffer is not None
         root = self.locals["callback"]
-        self._run = RunState(agent, root)
+        self._run, self._begun = RunState(agent, root), True
         self._settings = describe_agent(agent)
         self._vec_env = describe_vec_env(agent.env)
         self._position, self._rows_added = agent.replay_buffer.pos, rows_held(agent.replay_buffer)

@@ -23,7 +23,7 @@ from sb3_mcbs.snapshot.functions import FunctionName
 from sb3_mcbs.snapshot.graph import Ref, class_name
 
 #: Compiled containers that are made by calling their class; nothing else is ever called.
-_CALLED = (OrderedDict, defaultdict)
+CALLED = (OrderedDict, defaultdict)
 _PLAIN_DTYPES = "biufc"
 
 
@@ -135,7 +135,7 @@ class Encoder:
         :raises CheckpointError: if one can only be made by calling something.
         """
         for kind, payload in nodes:
-            if kind == "reduced" and payload[0] not in _CALLED:
+            if kind == "reduced" and payload[0] not in CALLED:
                 name = self._name(payload[0]) if not isinstance(payload[0], Ref) else "a function"
                 raise CheckpointError(
                     f"An object that is made by calling {name} cannot be written as data. Register a pair of "
@@ -195,7 +195,7 @@ class Decoder:
         """
         nodes = tuple((kind, self.decode(payload)) for kind, payload in data)
         for kind, payload in nodes:
-            if kind == "reduced" and payload[0] not in _CALLED:
+            if kind == "reduced" and payload[0] not in CALLED:
                 raise CheckpointError("The checkpoint asks for a call that no checkpoint needs.")
             if kind == "builtin" and payload[1] is not None and _method_name(payload[0]) not in self._names:
                 raise CheckpointError(f"The checkpoint names a method {payload[0]!r} that is not used here.")

@@ -5,12 +5,13 @@ from typing import Any
 import numpy as np
 import torch as th
 
-from sb3_mcbs.checkpoints.encoding import codec_of
+from sb3_mcbs.checkpoints.encoding import CALLED, codec_of
 from sb3_mcbs.snapshot import SnapshotMismatchError, SnapshotUnsupportedError
 from sb3_mcbs.snapshot.arrays import ArrayKind
 from sb3_mcbs.snapshot.graph import Copier, Freezer, Kind, Thawer, class_name
 from sb3_mcbs.snapshot.kinds import KINDS as ENVIRONMENT_KINDS
 from sb3_mcbs.snapshot.kinds import kind_of as environment_kind_of
+from sb3_mcbs.snapshot.objects import ReducedKind
 
 
 class _NotCopied:
@@ -26,6 +27,15 @@ class OwnedArrayKind(ArrayKind):
     def freeze(self, freezer: Freezer, obj: np.ndarray) -> Any:
         form, *rest = super().freeze(freezer, obj)
         return ("own" if form == "borrowed" else form, *rest)
+
+
+class CalledKind(ReducedKind):
+    """Compiled containers that are made by calling their class. No checkpoint asks for another call."""
+
+    def freeze(self, freezer: Freezer, obj: Any) -> Any:
+        if not isinstance(obj, CALLED):
+            raise SnapshotUnsupportedError(f"a {class_name(type(obj))} cannot be written as data")
+        return super().freeze(freezer, obj)
 
 
 class TensorKind(_NotCopied):
@@ -110,6 +120,7 @@ _OWN: dict[str, Kind] = {
     kind.name: kind
     for kind in (
         OwnedArrayKind(),
+        CalledKind(),
         TensorKind(),
         OptimizerKind(),
         NamedTupleKind(),
@@ -140,4 +151,5 @@ def kind_of(obj: Any) -> Kind | None:
         return _OWN["namedtuple"]
     if isinstance(obj, th.nn.Module):
         return _OWN["network"]
-    return environment_kind_of(obj)
+    kind = environment_kind_of(obj)
+    return _OWN["reduced"] if kind is ENVIRONMENT_KINDS["reduced"] else kind

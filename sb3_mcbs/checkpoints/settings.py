@@ -5,6 +5,7 @@ import platform
 from importlib.metadata import version
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import NStepReplayBuffer
@@ -130,6 +131,12 @@ def make_vec_env(description: dict[str, Any]) -> VecEnv:
     :param description: from :func:`describe_vec_env`.
     """
     makers = [_Maker(environment) for environment in description["environments"]]
+    for environment in description["environments"]:
+        if environment["id"] not in gym.registry:
+            raise CheckpointError(
+                f"The environment {environment['id']!r} is not registered here. Import the package that "
+                "registers it, or pass env."
+            )
     vec_env: VecEnv = _VEC_ENVS[description["class"]](makers)
     for name, arguments in description["layers"]:
         if name == "VecNormalize":

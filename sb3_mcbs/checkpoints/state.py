@@ -122,11 +122,13 @@ class RunState:
         parts = self._components
         freezer = Freezer(kind_of, {id(part): Ref(i) for i, part in enumerate(parts.values())}, len(parts))
         encoder = Encoder()
-        attributes = {}
+        attributes: dict[str, Any] = {}
+        nodes: list[Any] = []
         for name, part in parts.items():
             try:
                 frozen = freeze_attributes(freezer, part, not_state_of(part), skip_unsupported=False)
                 attributes[name] = encoder.encode(frozen)
+                nodes += encoder.encode_nodes(tuple(freezer.nodes[len(nodes) :]))
             except (SnapshotUnsupportedError, CheckpointError) as error:
                 raise CheckpointError(_refusal(name, part, error)) from error
         rest = {
@@ -138,7 +140,7 @@ class RunState:
         data = {
             "attributes": attributes,
             "rest": encoder.encode(rest),
-            "nodes": encoder.encode_nodes(tuple(freezer.nodes)),
+            "nodes": nodes,
         }
         return encoder, Encoded(data, encoder.arrays)
 
