@@ -207,6 +207,10 @@ def test_networks_are_there_before_learn(tmp_path):
     observation = np.array([[0.5, 0.5, 1.0]], dtype=np.float32)
     assert isinstance(again, MCBSTD3)
     assert np.array_equal(agent.predict(observation)[0], again.predict(observation)[0])
+    agent.save(tmp_path / "saved")
+    loaded = MCBSTD3.load(tmp_path / "saved")
+    assert np.array_equal(agent.predict(observation)[0], loaded.predict(observation)[0])
+    assert not {"_resumption", "_setup_learn"} & set(vars(loaded))
     fresh = RUNS["MCBSTD3"](tmp_path / "fresh")
     assert not np.array_equal(agent.predict(observation)[0], fresh.predict(observation)[0])
 

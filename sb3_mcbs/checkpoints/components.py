@@ -30,6 +30,7 @@ NOT_STATE: dict[type, dict[str, str]] = {
         "_checked_env": "a view of the environment",
         "_resumption": "only there until a run was resumed",
         "_setup_learn": "only replaced until a run was resumed",
+        "_excluded_save_params": "only replaced until a run was resumed",
     },
     SearchPolicy: {
         "searcher": "its forward model simulates the environments as they are; what it noticed is saved",

@@ -9,6 +9,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_mcbs.checkpoints.buffers import write_rows
+from sb3_mcbs.checkpoints.components import callbacks
 from sb3_mcbs.checkpoints.encoding import Encoded
 from sb3_mcbs.checkpoints.errors import CheckpointError
 from sb3_mcbs.checkpoints.files import make_logger
@@ -19,6 +20,8 @@ from sb3_mcbs.checkpoints.store import Checkpoint, Store
 logger = logging.getLogger("sb3_mcbs")
 
 _PENDING = "_resumption"
+#: Attributes that an agent has of its own until its run was resumed.
+_UNTIL_RESUMED = (_PENDING, "_setup_learn", "_excluded_save_params")
 
 
 class Resumption:
@@ -55,16 +58,21 @@ class Resumption:
         agent.set_logger(make_logger(folder, formats, manifest["num_timesteps"] + 1, roots))
         # learn() adds this to the steps that it is asked for if it is not to count from 0.
         agent.num_timesteps = manifest["num_timesteps_at_start"]
-        setattr(agent, _PENDING, self)
-        original = agent._setup_learn
+        setup_learn, excluded_save_params = agent._setup_learn, agent._excluded_save_params
 
-        def setup_learn(*args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
-            total, callback = original(*args, **kwargs)
+        def checked_setup_learn(*args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+            total, callback = setup_learn(*args, **kwargs)
             self.check_call(agent, callback)
-            del agent._setup_learn
             return total, callback
 
-        agent._setup_learn = setup_learn  # type: ignore[method-assign]
+        # Without the callback nobody would notice that the run starts from the beginning.
+        vars(agent).update(
+            {
+                _PENDING: self,
+                "_setup_learn": checked_setup_learn,
+                "_excluded_save_params": lambda: [*excluded_save_params(), *_UNTIL_RESUMED],
+            }
+        )
 
     def check_call(self, agent: OffPolicyAlgorithm, callback: BaseCallback) -> None:
         """Refuse a call of ``learn`` that would not finish the run.
@@ -73,8 +81,6 @@ class Resumption:
         :param callback: its callback.
         :raises CheckpointError: names the difference.
         """
-        from sb3_mcbs.checkpoints.components import callbacks
-
         saved, now = self.checkpoint.manifest["total_timesteps"], agent._total_timesteps
         if saved != now:
             raise CheckpointError(
@@ -105,7 +111,8 @@ class Resumption:
         checkpoint = self.checkpoint
         write_rows(agent.replay_buffer, self.store.read_rows(checkpoint.manifest["rows"]))
         run.restore(Captured(checkpoint.state, checkpoint.arrays), self.classes)
-        delattr(agent, _PENDING)
+        for name in _UNTIL_RESUMED:
+            del vars(agent)[name]
         self._say(agent)
 
     def _say(self, agent: OffPolicyAlgorithm) -> None:
