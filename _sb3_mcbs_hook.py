@@ -18,6 +18,9 @@ SWITCH = "SB3_MCBS_NO_ZOO_HOOK"
 # The last one is ours: whoever imports it first imports rl_zoo3.exp_manager half-way through it, when the
 # class that belongs into rl_zoo3.exp_manager does not exist yet.
 WATCHED = ("rl_zoo3.utils", "rl_zoo3.hyperparams_opt", "rl_zoo3.exp_manager", "sb3_mcbs.zoo.manager")
+# Commands that name the off-policy algorithms within their code. ``python -m`` runs that code and imports
+# nothing, so it is changed on the way.
+COMMANDS = ("rl_zoo3.enjoy", "rl_zoo3.record_video", "rl_zoo3.push_to_hub")
 
 
 def _register(module: "Any") -> None:
@@ -26,15 +29,29 @@ def _register(module: "Any") -> None:
 
         registration.after_import(module)
     except Exception as error:
-        import warnings
+        _warn(module.__name__, error)
 
-        warnings.warn(
-            f"sb3-mcbs could not register its algorithms when {module.__name__} was imported "
-            f"({type(error).__name__}: {error}). RL Zoo's own algorithms are not affected. Repair the "
-            f"installation (pip install --force-reinstall sb3-mcbs), or set {SWITCH}=1 to silence this.",
-            RuntimeWarning,
-            stacklevel=2,
-        )
+
+def _extend(name: str, code: "Any") -> "Any":
+    try:
+        from sb3_mcbs.zoo import registration
+
+        return registration.with_our_off_policy_names(code)
+    except Exception as error:
+        _warn(name, error)
+        return code
+
+
+def _warn(name: str, error: Exception) -> None:
+    import warnings
+
+    warnings.warn(
+        f"sb3-mcbs could not register its algorithms when {name} was imported "
+        f"({type(error).__name__}: {error}). RL Zoo's own algorithms are not affected. Repair the "
+        f"installation (pip install --force-reinstall sb3-mcbs), or set {SWITCH}=1 to silence this.",
+        RuntimeWarning,
+        stacklevel=3,
+    )
 
 
 class ZooFinder:
@@ -47,7 +64,7 @@ class ZooFinder:
         :param target: the module itself if it is being reloaded
         :return: the spec the other finders gave, or None for every module but the watched ones
         """
-        if fullname not in WATCHED:
+        if fullname not in WATCHED and fullname not in COMMANDS:
             return None
         for finder in sys.meta_path:
             find_spec = getattr(finder, "find_spec", None)
@@ -56,7 +73,7 @@ class ZooFinder:
                 continue
             spec = find_spec(fullname, path, target)
             if spec is not None:
-                return _announcing(spec)
+                return _announcing(spec) if fullname in WATCHED else _extending(spec)
         return None
 
 
@@ -70,6 +87,12 @@ def _announcing(spec: "Any") -> "Any":
 
     # On the instance, so that the loader keeps its class and with it all that other tools ask of a loader.
     loader.exec_module = exec_module
+    return spec
+
+
+def _extending(spec: "Any") -> "Any":
+    get_code = spec.loader.get_code
+    spec.loader.get_code = lambda name: _extend(name, get_code(name))
     return spec
 
 

@@ -3,7 +3,11 @@
 from importlib.metadata import PackageNotFoundError, version
 
 from sb3_mcbs.algorithms import (
+    MCBS,
+    MCBSDDPG,
+    MCBSSAC,
     MCBSTD3,
+    MCBSTQC,
     AgentFileError,
     SearchPolicy,
     load_agent,
@@ -22,7 +26,11 @@ except PackageNotFoundError:  # a checkout that was not installed
     __version__ = "0+unknown"
 
 __all__ = [
+    "MCBS",
+    "MCBSDDPG",
+    "MCBSSAC",
     "MCBSTD3",
+    "MCBSTQC",
     "AgentFileError",
     "CheckpointError",
     "ExactCheckpointCallback",

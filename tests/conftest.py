@@ -8,15 +8,26 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from sb3_contrib import TQC
+from stable_baselines3 import DDPG, SAC, TD3
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_mcbs import MCBSTD3, SnapshotEnvWrapper
+from sb3_mcbs import MCBS, MCBSDDPG, MCBSSAC, MCBSTD3, MCBSTQC, SnapshotEnvWrapper
 
 # Small networks are fastest on one thread, and idle OpenMP threads would take cores from the simulations.
 th.set_num_threads(1)
 
 SMALL = dict(policy_kwargs=dict(net_arch=[16, 16]), buffer_size=2000, batch_size=16, device="cpu")
 SMALL_SEARCH = dict(beam_width=3, rollout_depth=2, n_simulations=2, n_threads=1)
+#: Every algorithm that searches, and what it is without.
+WITHOUT_SEARCH: dict[type[MCBS], type[OffPolicyAlgorithm]] = {
+    MCBSTD3: TD3,
+    MCBSDDPG: DDPG,
+    MCBSSAC: SAC,
+    MCBSTQC: TQC,
+}
+SEARCHING = list(WITHOUT_SEARCH)
 
 
 class DictPendulum(gym.ObservationWrapper):
@@ -34,11 +45,11 @@ class DictPendulum(gym.ObservationWrapper):
 
 
 @pytest.fixture
-def make_agent() -> Callable[..., MCBSTD3]:
-    """Build a small MCBSTD3; keyword arguments override its settings."""
+def make_agent() -> Callable[..., MCBS]:
+    """Build a small MCBSTD3, or another algorithm; keyword arguments override its settings."""
 
-    def make(env="Pendulum-v1", policy: str = "MlpPolicy", cls: type = MCBSTD3, **settings) -> MCBSTD3:
-        search = SMALL_SEARCH if issubclass(cls, MCBSTD3) else {}
+    def make(env="Pendulum-v1", policy: str = "MlpPolicy", cls: type = MCBSTD3, **settings) -> MCBS:
+        search = SMALL_SEARCH if issubclass(cls, MCBS) else {}
         # SAC writes into the policy_kwargs that it is given.
         return cls(policy, env, **{"seed": 0, "learning_starts": 20, **deepcopy(SMALL), **search, **settings})
 

@@ -18,7 +18,16 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecFrameStack, VecMonitor, VecNormalize
 
-from sb3_mcbs import MCBSTD3, ExactCheckpointCallback, SnapshotEnvWrapper, resume
+from sb3_mcbs import (
+    MCBS,
+    MCBSDDPG,
+    MCBSSAC,
+    MCBSTD3,
+    MCBSTQC,
+    ExactCheckpointCallback,
+    SnapshotEnvWrapper,
+    resume,
+)
 from sb3_mcbs.checkpoints import CheckpointError
 from tests.checkpoint_helpers import Crash, assert_resumed_is_exact, assert_same_runs, crash, learn
 
@@ -28,7 +37,7 @@ SEARCH = dict(beam_width=3, rollout_depth=2, n_simulations=2, n_threads=1)
 
 def maker(cls, env_id="Pendulum-v1", n_envs=1, vec_env_cls=None, wrap=lambda vec_env: vec_env, **settings):
     """How to make an agent in a folder."""
-    search = SEARCH if issubclass(cls, MCBSTD3) else {}
+    search = SEARCH if issubclass(cls, MCBS) else {}
     kwargs = {"policy_kwargs": dict(net_arch=[16, 16]), "buffer_size": 90, **SMALL, **search, **settings}
     policy = kwargs.pop("policy", "MlpPolicy")
 
@@ -65,6 +74,9 @@ RUNS = {
     ),
     "MCBSTD3, pool": maker(MCBSTD3, forward_model="pool"),
     "MCBSTD3, MuJoCo": maker(MCBSTD3, "InvertedPendulum-v5"),
+    "MCBSDDPG": maker(MCBSDDPG),
+    "MCBSSAC, gSDE": maker(MCBSSAC, use_sde=True, use_sde_at_warmup=True),
+    "MCBSTQC": maker(MCBSTQC),
     "TD3, Ornstein-Uhlenbeck, two environments": maker(TD3, n_envs=2, action_noise=OU_NOISE),
     "TD3, whole episodes": maker(TD3, "InvertedPendulum-v5", train_freq=(1, "episode"), gradient_steps=-1),
     "DDPG, large buffer": maker(DDPG, buffer_size=1000),

@@ -18,9 +18,9 @@ from torch import nn
 from sb3_mcbs import MCBSTD3, AgentFileError, SearchPolicy, load_agent
 from sb3_mcbs.algorithms import agent_file
 from tests import agent_files as files
-from tests.conftest import SMALL_SEARCH, assert_same_parameters
+from tests.conftest import SEARCHING, SMALL_SEARCH, assert_same_parameters
 
-ALL = [TD3, DDPG, SAC, TQC, MCBSTD3]
+ALL = [TD3, DDPG, SAC, TQC, *SEARCHING]
 
 
 @pytest.fixture
@@ -110,7 +110,11 @@ def test_numbers_are_taken_over(saved):
     _, path = saved(TQC, gamma=0.9, ent_coef="auto_0.1", top_quantiles_to_drop_per_net=3)
     loaded = load(path)
     assert (loaded.gamma, loaded.ent_coef, loaded.top_quantiles_to_drop_per_net) == (0.9, "auto_0.1", 3)
-    agent, path = saved(MCBSTD3, beam_width=7, rollout_noise=0.03, include_policy_action=True)
+
+
+@pytest.mark.parametrize("cls", SEARCHING)
+def test_search_settings_are_taken_over(saved, cls):
+    agent, path = saved(cls, beam_width=7, rollout_noise=0.03, include_policy_action=True)
     loaded = load(path)
     assert loaded.search_settings == agent.search_settings
     assert SearchPolicy(loaded, make_vec_env("Pendulum-v1", 1)).settings.beam_width == 7
@@ -221,7 +225,7 @@ def test_other_policies_are_refused_by_name(saved, make_agent, make_dict_env, tm
         load(files.with_policy(path, tmp_path / "cnn.zip", state))
     with pytest.raises(ValueError, match="without a features extractor of their own"):
         load(path, policy_kwargs=dict(features_extractor_class=Wave))
-    with pytest.raises(AgentFileError, match="not those of a TD3, DDPG, SAC, TQC or MCBSTD3"):
+    with pytest.raises(AgentFileError, match="not those of a TD3, DDPG, SAC or TQC agent"):
         load(files.with_policy(path, tmp_path / "ppo.zip", {"mlp_extractor.0.weight": th.zeros(3, 3)}))
 
 

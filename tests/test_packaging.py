@@ -135,7 +135,7 @@ def test_installation_registers_in_any_folder(installed: Environment, tmp_path: 
         "import sys; assert not [m for m in sys.modules if m.startswith(('sb3_mcbs', 'rl_zoo3', 'torch'))];"
         "import rl_zoo3.train as t; print('mcbs_td3' in t.ALGOS, t.ExperimentManager.__name__);"
         "from sb3_mcbs.zoo.paths import *\n"
-        "print(hyperparams_path('td3'), (PACKAGE_ROOT / 'py.typed').is_file())"
+        "print(hyperparams_path('mcbs_tqc'), (PACKAGE_ROOT / 'py.typed').is_file())"
     )
     added, manager, file, typed = installed.run("-c", code, cwd=tmp_path).split()
     assert (added, manager, typed) == ("True", "MCBSExperimentManager", "True")

@@ -1,12 +1,16 @@
 """The whole search on real environments against Algorithm 1 done with ``env.step`` and loops."""
 
+from copy import deepcopy
+
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from sb3_contrib import TQC
+from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_mcbs import MCBSTD3, SearchSettings
+from sb3_mcbs import MCBSDDPG, MCBSSAC, MCBSTD3, MCBSTQC, SearchSettings
 from sb3_mcbs.algorithms.searcher import Searcher
 from sb3_mcbs.search import beam_search, draw_noise
 from tests.conftest import SMALL
@@ -23,11 +27,15 @@ def reference_for(agent, env):
 
     def policy(observation):
         with th.no_grad():
-            return agent.actor(tensor(observation)).numpy()[0]
+            how = dict(deterministic=True) if isinstance(agent, SAC | TQC) else {}
+            return agent.actor(tensor(observation), **how).numpy()[0]
 
     def critics(observation, action):
         with th.no_grad():
-            return [float(q) for q in agent.critic(tensor(observation), th.as_tensor(action[None]))]
+            estimates = agent.critic(tensor(observation), th.as_tensor(action[None]))
+            if isinstance(agent, TQC):
+                return [float(estimates.mean())]  # of all quantiles of all critics
+            return [float(q) for q in estimates]
 
     def env_step(action):
         observation, reward, terminated, _, _ = simulator.step(agent.policy.unscale_action(action))
@@ -57,10 +65,34 @@ CASES = [
 
 @pytest.mark.parametrize("env_id, kwargs, kind, steps", CASES, ids=[f"{case[0]}-{case[2]}" for case in CASES])
 def test_same_values_and_choice(env_id, kwargs, kind, steps):
+    assert_same_values_and_choice(MCBSTD3, SMALL, env_id, kwargs, kind, steps)
+
+
+AGENTS = [
+    (MCBSTD3, dict(policy_kwargs=dict(net_arch=[16, 16], n_critics=3))),
+    (MCBSTD3, dict(policy_kwargs=dict(net_arch=[16, 16], n_critics=1))),
+    (MCBSDDPG, {}),
+    (MCBSSAC, {}),
+    (MCBSSAC, dict(policy_kwargs=dict(net_arch=[16, 16], n_critics=5))),
+    (MCBSSAC, dict(use_sde=True)),
+    (MCBSTQC, {}),
+    (MCBSTQC, dict(policy_kwargs=dict(net_arch=[16, 16], n_critics=3, n_quantiles=7))),
+    (MCBSTQC, dict(use_sde=True)),
+]
+
+
+@pytest.mark.parametrize("cls, settings", AGENTS)
+def test_same_values_and_choice_with_every_agent(cls, settings):
+    settings = {**deepcopy(SMALL), **settings}
+    assert_same_values_and_choice(cls, settings, "Swimmer-v5", {}, "mujoco", 5)
+    assert_same_values_and_choice(cls, settings, "InvertedPendulum-v5", {}, "pool", 4)
+
+
+def assert_same_values_and_choice(cls, agent_settings, env_id, kwargs, kind, steps):
     vec_env = DummyVecEnv([lambda: gym.make(env_id, **kwargs)])
     vec_env.seed(3)
     settings = SearchSettings(4, 3, 3, beam_noise=0.4, n_threads=1, forward_model=kind)
-    agent = MCBSTD3("MlpPolicy", vec_env, seed=1, rollout_depth=0, **SMALL)
+    agent = cls("MlpPolicy", vec_env, seed=1, rollout_depth=0, **agent_settings)
     searcher = Searcher(agent, vec_env, settings)
     rng = np.random.default_rng(0)
     terminated_inside = False

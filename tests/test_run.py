@@ -1,11 +1,10 @@
-"""MCBSTD3 trains: every kind of environment and policy, SB3's own behaviour kept."""
+"""Agents that search train: every kind of environment and policy, SB3's own behaviour kept."""
 
 import json
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from stable_baselines3 import TD3
 from stable_baselines3.common.callbacks import CallbackList, CheckpointCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
@@ -19,9 +18,15 @@ from stable_baselines3.common.vec_env import (
     VecNormalize,
 )
 
-from sb3_mcbs import MCBSTD3, SnapshotEnvWrapper
+from sb3_mcbs import MCBSSAC, MCBSTD3, MCBSTQC, SnapshotEnvWrapper
 from sb3_mcbs.models import ForwardModelError
-from tests.conftest import assert_same_parameters, parameters_of, snapshot_vec_env
+from tests.conftest import (
+    SEARCHING,
+    WITHOUT_SEARCH,
+    assert_same_parameters,
+    parameters_of,
+    snapshot_vec_env,
+)
 
 
 def logged(agent, folder):
@@ -30,31 +35,46 @@ def logged(agent, folder):
     return lambda: [json.loads(line) for line in (folder / "progress.json").read_text().splitlines()]
 
 
-@pytest.mark.parametrize("env_id", ["HalfCheetah-v5", "Pendulum-v1"])
-@pytest.mark.parametrize("depth", [0, 1, 3])
-def test_trains(make_agent, env_id, depth):
-    agent = make_agent(env_id, rollout_depth=depth)
-    before = parameters_of(agent)["actor.mu.0.weight"]
+@pytest.mark.parametrize(
+    "cls, env_id, depth",
+    [
+        *((MCBSTD3, env_id, depth) for env_id in ("HalfCheetah-v5", "Pendulum-v1") for depth in (0, 1, 3)),
+        *((cls, *case) for cls in SEARCHING[1:] for case in [("HalfCheetah-v5", 3), ("Pendulum-v1", 0)]),
+    ],
+)
+def test_trains(make_agent, cls, env_id, depth):
+    agent = make_agent(env_id, cls=cls, rollout_depth=depth)
+    before = parameters_of(agent)
     agent.learn(60)
     assert agent.num_timesteps == 60 and agent.n_decisions == 40
     if depth:
         assert agent._searcher.model.kind == ("mujoco" if env_id == "HalfCheetah-v5" else "pool")
     first_steps, later_steps = 3, (depth - 1) * 6
     assert agent.n_simulated_steps == (40 * (first_steps + later_steps) if depth else 0)
-    assert not np.array_equal(before, parameters_of(agent)["actor.mu.0.weight"])
+    after = parameters_of(agent)
+    for name in before:
+        assert not np.array_equal(before[name], after[name]), name
 
 
-def test_dict_observations(make_agent, make_dict_env):
-    agent = make_agent(make_dict_env(), policy="MultiInputPolicy")
+@pytest.mark.parametrize("cls", SEARCHING)
+def test_dict_observations(make_agent, make_dict_env, cls):
+    agent = make_agent(make_dict_env(), policy="MultiInputPolicy", cls=cls)
     agent.learn(40)
     assert agent.n_decisions == 20
 
 
-@pytest.mark.parametrize("vec_env_cls", [DummyVecEnv, SubprocVecEnv])
-@pytest.mark.parametrize("env_id", ["Swimmer-v5", "Pendulum-v1"])
-def test_many_environments(make_agent, vec_env_cls, env_id):
+@pytest.mark.parametrize(
+    "cls, env_id, vec_env_cls",
+    [
+        *((cls, "Pendulum-v1", DummyVecEnv) for cls in SEARCHING),
+        (MCBSTD3, "Swimmer-v5", DummyVecEnv),
+        (MCBSTD3, "Swimmer-v5", SubprocVecEnv),
+        (MCBSTD3, "Pendulum-v1", SubprocVecEnv),
+    ],
+)
+def test_many_environments(make_agent, cls, env_id, vec_env_cls):
     env = VecMonitor(snapshot_vec_env(env_id, 2, vec_env_cls=vec_env_cls))
-    agent = make_agent(VecNormalize(env), n_threads=2)
+    agent = make_agent(VecNormalize(env), cls=cls, n_threads=2)
     agent.learn(60)
     assert agent.n_decisions == 40
     env.close()
@@ -81,25 +101,49 @@ def test_unknown_vectorized_wrapper_is_refused(make_agent):
         make_agent(VecFrameStack(make_vec_env("Pendulum-v1", 1), 2))
 
 
-def test_same_seed_same_run_and_threads_change_nothing(make_agent):
+@pytest.mark.parametrize("cls", [MCBSTD3, MCBSSAC])
+def test_same_seed_same_run_and_threads_change_nothing(make_agent, cls):
     one, two, other = (
-        make_agent("Hopper-v5", seed=s, n_threads=n).learn(60) for s, n in [(3, 1), (3, 2), (4, 1)]
+        make_agent("Hopper-v5", cls=cls, seed=s, n_threads=n).learn(60) for s, n in [(3, 1), (3, 2), (4, 1)]
     )
     assert_same_parameters(one, two)
     np.testing.assert_array_equal(one.replay_buffer.actions[:60], two.replay_buffer.actions[:60])
     assert not np.array_equal(one.replay_buffer.actions[:60], other.replay_buffer.actions[:60])
 
 
-def test_before_learning_starts_it_is_td3(make_agent):
-    """The same random numbers are drawn in the same order as in TD3 until the first search."""
+GSDE = dict(use_sde=True, use_sde_at_warmup=True, sde_sample_freq=4)
+
+
+@pytest.mark.parametrize(
+    "cls, settings", [*((cls, {}) for cls in SEARCHING), (MCBSSAC, GSDE), (MCBSTQC, GSDE)]
+)
+def test_before_learning_starts_it_is_the_agent_without_search(make_agent, cls, settings):
+    """The same random numbers are drawn in the same order as without search until the first one."""
     noise = NormalActionNoise(np.zeros(1), 0.1 * np.ones(1))
-    agents = [make_agent(cls=cls, action_noise=noise, learning_starts=30).learn(30) for cls in (TD3, MCBSTD3)]
+    settings = dict(action_noise=noise, learning_starts=30, **settings)
+    agents = [make_agent(cls=which, **settings).learn(30) for which in (WITHOUT_SEARCH[cls], cls)]
     plain, searching = (agent.replay_buffer.actions[:30] for agent in agents)
     np.testing.assert_array_equal(plain, searching)
     assert agents[1].n_decisions == 0
 
 
-def test_searched_action_is_executed_and_stored_as_it_is(make_agent):
+@pytest.mark.parametrize("cls", [MCBSSAC, MCBSTQC])
+@pytest.mark.parametrize("settings", [{}, GSDE])
+def test_search_is_around_the_mean_action(make_agent, cls, settings):
+    """Neither the actor's distribution nor gSDE decides what is searched, however wide they are."""
+    policy_kwargs = dict(net_arch=[16], log_std_init=1.0) if settings else dict(net_arch=[16])
+    agent = make_agent(cls=cls, beam_noise=0, policy_kwargs=policy_kwargs, learning_rate=0.0, **settings)
+    agent.learn(40)
+    observations = agent.replay_buffer.observations[20:40, 0]
+    mean, _ = agent.predict(observations, deterministic=True)
+    drawn, _ = agent.predict(observations, deterministic=False)
+    searched = agent.policy.unscale_action(agent.replay_buffer.actions[20:40, 0])
+    np.testing.assert_allclose(searched, mean, rtol=1e-4, atol=1e-5)
+    assert np.abs(drawn - mean).max() > 0.1
+
+
+@pytest.mark.parametrize("cls", SEARCHING)
+def test_searched_action_is_executed_and_stored_as_it_is(make_agent, cls):
     """RL Zoo's settings contain action noise; SB3 would add it to the chosen action."""
     executed = []
 
@@ -109,7 +153,7 @@ def test_searched_action_is_executed_and_stored_as_it_is(make_agent):
             return action
 
     env = Spy(gym.make("Pendulum-v1"))
-    agent = make_agent(env, action_noise=NormalActionNoise(np.zeros(1), 5.0 * np.ones(1)))
+    agent = make_agent(env, cls=cls, action_noise=NormalActionNoise(np.zeros(1), 5.0 * np.ones(1)))
     chosen = []
     agent._setup_learn(1)
     search = agent._searcher.search
@@ -122,12 +166,14 @@ def test_searched_action_is_executed_and_stored_as_it_is(make_agent):
     assert len(real) == 20
 
 
-def test_action_noise_after_search_is_an_option(make_agent):
+@pytest.mark.parametrize("cls", SEARCHING)
+def test_action_noise_after_search_is_an_option(make_agent, cls):
     noise = NormalActionNoise(np.zeros(1), 5.0 * np.ones(1))
-    quiet = make_agent(action_noise=noise).learn(40).replay_buffer.actions[20:40]
-    loud = (
-        make_agent(action_noise=noise, action_noise_after_search=True).learn(40).replay_buffer.actions[20:40]
+    quiet, loud = (
+        make_agent(cls=cls, action_noise=noise, action_noise_after_search=after).learn(40).replay_buffer
+        for after in (False, True)
     )
+    quiet, loud = quiet.actions[20:40], loud.actions[20:40]
     assert np.mean(np.abs(loud) == 1) > 0.5 > np.mean(np.abs(quiet) == 1)
 
 

@@ -2,17 +2,17 @@
 
 import numpy as np
 import pytest
-from stable_baselines3 import TD3
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_mcbs import MCBSTD3
-from tests.conftest import assert_same_parameters
+from tests.conftest import SEARCHING, WITHOUT_SEARCH, assert_same_parameters
 
 
-def test_settings_and_networks_survive(make_agent, tmp_path):
-    agent = make_agent(beam_width=4, rollout_noise=0.05, include_policy_action=True).learn(40)
+@pytest.mark.parametrize("cls", SEARCHING)
+def test_settings_and_networks_survive(make_agent, tmp_path, cls):
+    agent = make_agent(cls=cls, beam_width=4, rollout_noise=0.05, include_policy_action=True).learn(40)
     agent.save(tmp_path / "agent")
-    loaded = MCBSTD3.load(tmp_path / "agent", env=make_vec_env("Pendulum-v1", 1), device="cpu")
+    loaded = cls.load(tmp_path / "agent", env=make_vec_env("Pendulum-v1", 1), device="cpu")
     assert loaded.search_settings == agent.search_settings
     assert loaded.n_decisions == agent.n_decisions == 20
     assert_same_parameters(agent, loaded)
@@ -20,12 +20,14 @@ def test_settings_and_networks_survive(make_agent, tmp_path):
     assert loaded.n_decisions == 60  # the warm-up is over
 
 
-def test_load_without_environment_predicts(make_agent, tmp_path):
-    agent = make_agent().learn(30)
+@pytest.mark.parametrize("cls", SEARCHING)
+def test_load_without_environment_predicts(make_agent, tmp_path, cls):
+    agent = make_agent(cls=cls).learn(30)
     agent.save(tmp_path / "agent")
-    loaded = MCBSTD3.load(tmp_path / "agent", device="cpu")
+    loaded = cls.load(tmp_path / "agent", device="cpu")
     observation = np.array([[0.1, 0.2, 0.3]], dtype=np.float32)
-    np.testing.assert_array_equal(loaded.predict(observation)[0], agent.predict(observation)[0])
+    actions = (which.predict(observation, deterministic=True)[0] for which in (loaded, agent))
+    np.testing.assert_array_equal(*actions)
     loaded.set_env(make_vec_env("Pendulum-v1", 1))
     loaded.learn(30)
 
@@ -38,17 +40,21 @@ def test_settings_can_be_changed_when_loading(make_agent, tmp_path):
         MCBSTD3.load(tmp_path / "agent", beam_width=0, device="cpu")
 
 
-def test_bad_settings_are_refused_at_construction(make_agent):
+@pytest.mark.parametrize("cls", SEARCHING)
+def test_bad_settings_are_refused_at_construction(make_agent, cls):
     with pytest.raises(ValueError, match="rollout_depth"):
-        make_agent(rollout_depth=-1)
+        make_agent(cls=cls, rollout_depth=-1)
     with pytest.raises(TypeError, match="action_noise_after_search"):
-        make_agent(action_noise_after_search="yes")
+        make_agent(cls=cls, action_noise_after_search="yes")
+    with pytest.raises(TypeError, match=rf"{cls.__name__} got unexpected.*'beam'.*beam_width"):
+        make_agent(cls=cls, beam=6)
 
 
-def test_a_plain_td3_file_loads(make_agent, tmp_path):
-    plain = make_agent(cls=TD3).learn(30)
-    plain.save(tmp_path / "td3")
-    agent = MCBSTD3.load(tmp_path / "td3", env=make_vec_env("Pendulum-v1", 1), beam_width=4, device="cpu")
+@pytest.mark.parametrize("cls", SEARCHING)
+def test_a_file_of_the_agent_without_search_loads(make_agent, tmp_path, cls):
+    plain = make_agent(cls=WITHOUT_SEARCH[cls]).learn(30)
+    plain.save(tmp_path / "plain")
+    agent = cls.load(tmp_path / "plain", env=make_vec_env("Pendulum-v1", 1), beam_width=4, device="cpu")
     assert_same_parameters(plain, agent)
     agent.learn(20, reset_num_timesteps=False)
     assert agent.n_decisions == 20 and agent.beam_width == 4

@@ -10,10 +10,10 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize, sync_envs_normalization
 
 from sb3_mcbs import MCBSTD3, SearchPolicy, SearchSettings, SnapshotEnvWrapper
-from tests.conftest import SMALL_SEARCH, snapshot_vec_env
+from tests.conftest import SEARCHING, SMALL_SEARCH, snapshot_vec_env
 
 
-@pytest.mark.parametrize("cls", [TD3, DDPG, SAC, TQC, MCBSTD3])
+@pytest.mark.parametrize("cls", [TD3, DDPG, SAC, TQC, *SEARCHING])
 def test_every_agent(make_agent, cls):
     agent = make_agent(cls=cls).learn(40)
     env = make_vec_env("Pendulum-v1", 1, seed=1)

@@ -4,6 +4,7 @@ Sizes that are valid and large are not searched with, only checked: a search of 
 minutes and gigabytes, and differs from a small one in nothing but that.
 """
 
+import math
 import warnings
 from fractions import Fraction
 from typing import Any
@@ -17,7 +18,7 @@ from hypothesis import strategies as st
 from stable_baselines3.common.noise import NormalActionNoise
 
 from sb3_mcbs import MCBSTD3, SearchPolicy, SearchSettings, SnapshotEnvWrapper
-from sb3_mcbs.search import Agent, Pace, beam_search, deadline_search, draw_noise
+from sb3_mcbs.search import Agent, Decision, Pace, PlanMemory, deadline_search, search
 from tests.conftest import SMALL, snapshot_vec_env
 from tests.fake_model import LineWorld
 
@@ -64,6 +65,15 @@ VALID = {
     "matmul_precision": st.sampled_from([None, "highest", "high", "medium"]),
     "time_budget": st.none() | numbers(1e-6).map(lambda seconds: min(seconds, 0.01)),
     "max_beam_width": st.none() | integers(1, 6),
+    "strategy": st.sampled_from(["beam", "tree", "refine", np.str_("tree")]),
+    "n_proposals": st.none() | integers(1, 30),
+    "common_noise": st.booleans(),
+    "antithetic": st.booleans(),
+    "branching": integers(1, 3),
+    "one_node_per_root": st.booleans(),
+    "n_rounds": integers(1, 3),
+    "n_elites": st.none() | integers(1, 5),
+    "min_noise": numbers(),
 }
 assert VALID.keys() == set(SearchSettings.names())
 
@@ -84,7 +94,10 @@ def made(kwargs: dict[str, Any]) -> SearchSettings | None:
 
 def small(found: SearchSettings) -> bool:
     widest = max(found.beam_width, found.max_beam_width or 0)
-    return widest * found.n_simulations * max(found.rollout_depth, 1) <= 1000 and found.n_threads <= 64
+    factors = (found.n_simulations, max(found.rollout_depth, 1), found.branching, found.n_rounds)
+    return (
+        widest * math.prod(factors) <= 10_000 and (found.n_proposals or 0) <= 1000 and found.n_threads <= 64
+    )
 
 
 @fuzz
@@ -102,8 +115,9 @@ def test_settings_are_refused_or_search_a_small_world(kwargs: dict[str, Any]) ->
     )
     rng, roots, observations = np.random.default_rng(0), [0.5, -1.0], np.array([[0.5], [-1.0]])
     if found.time_budget is None:
-        noise = draw_noise(rng, found, 2, 1)
-        result = beam_search(LineWorld(), roots, observations, agent, found, noise, rng)
+        memory, moments = PlanMemory(2, found.rollout_depth, 1), [(0, 0), (0, 0)]
+        shape = (2, 1)
+        result = search(Decision(LineWorld(), roots, observations, agent, found, shape, rng, memory, moments))
     else:
         pace = Pace()
         deadline = pace.clock() + min(found.time_budget, 0.01)
@@ -227,6 +241,18 @@ def test_sizes_that_are_valid_but_not_together() -> None:
             r"beam_width \* n_simulations is 400000000",
         ),
         (dict(time_budget=1, max_beam_width=100_000, n_simulations=2), r"max_beam_width \* n_simulations"),
+        (
+            dict(strategy="tree", beam_width=1000, branching=1000),
+            r"beam_width \* branching \* n_simulations",
+        ),
+        (
+            dict(strategy="refine", beam_width=1000, n_rounds=1000),
+            r"beam_width \* n_rounds \* n_simulations",
+        ),
+        (
+            dict(strategy="refine", n_proposals=1000, n_rounds=1000),
+            r"n_proposals \* n_rounds \* n_simulations",
+        ),
     ):
         with pytest.raises(ValueError, match=words):
             SearchSettings(**kwargs)

@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from stable_baselines3 import TD3
+from stable_baselines3 import DDPG, TD3
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecNormalize
@@ -12,11 +12,11 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_mcbs.algorithms.td3_update import TD3Update
 
 
-def trained_pair(steps=200, env=None, **kwargs):
+def trained_pair(steps=200, env=None, cls=TD3, **kwargs):
     """Two agents from one seed and buffer, after SB3's updates and after ours."""
     agents = []
     for _ in range(2):
-        agent = TD3(
+        agent = cls(
             "MlpPolicy",
             make_vec_env("HalfCheetah-v5", 1, seed=0) if env is None else env(),
             seed=3,
@@ -52,6 +52,7 @@ CASES = {
     ),
     "learning rate schedule": dict(learning_rate=lambda remaining: 1e-3 * (0.5 + 0.5 * remaining)),
     "normalised": dict(env=lambda: VecNormalize(make_vec_env("HalfCheetah-v5", 1, seed=0))),
+    "DDPG": dict(cls=DDPG),
     "matrix observations": dict(env=lambda: make_vec_env(_matrix_env, 1, seed=0)),
 }
 
@@ -64,7 +65,9 @@ def _matrix_env():
 def test_same_networks_as_sb3_after_200_updates(case):
     theirs, ours = trained_pair(**CASES[case])
     assert theirs._n_updates == ours._n_updates == 200
-    before = TD3("MlpPolicy", theirs.get_env(), seed=3, device="cpu", policy_kwargs=theirs.policy_kwargs)
+    before = type(theirs)(
+        "MlpPolicy", theirs.get_env(), seed=3, device="cpu", policy_kwargs=theirs.policy_kwargs
+    )
     for name, expected in theirs.policy.state_dict().items():
         found, start = ours.policy.state_dict()[name], before.policy.state_dict()[name]
         np.testing.assert_allclose(found, expected, rtol=2e-3, atol=2e-4, err_msg=name)

@@ -1,6 +1,8 @@
-"""How ``mcbs_td3`` gets into RL Zoo: by the import hook, and explicitly."""
+"""How our algorithms get into RL Zoo: by the import hook, and explicitly."""
 
+import importlib
 import os
+import runpy
 import subprocess
 import sys
 import types
@@ -10,7 +12,10 @@ from pathlib import Path
 import pytest
 
 import _sb3_mcbs_hook as hook
+from sb3_mcbs import MCBS
 from sb3_mcbs.zoo import register, registration
+from sb3_mcbs.zoo.registration import ALGORITHMS
+from tests.conftest import SEARCHING
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -35,13 +40,16 @@ def test_register_fills_rl_zoos_tables_and_can_be_repeated() -> None:
     import rl_zoo3.hyperparams_opt
     import rl_zoo3.train
 
-    from sb3_mcbs import MCBSTD3
+    from sb3_mcbs.zoo import sampler
     from sb3_mcbs.zoo.manager import MCBSExperimentManager
 
-    assert rl_zoo3.ALGOS["mcbs_td3"] is MCBSTD3
+    assert {name: rl_zoo3.ALGOS[name] for name in ALGORITHMS} == ALGORITHMS
+    assert set(ALGORITHMS.values()) == set(SEARCHING)
     assert rl_zoo3.train.ALGOS is rl_zoo3.ALGOS
-    assert rl_zoo3.exp_manager.HYPERPARAMS_SAMPLER["mcbs_td3"].__module__ == "sb3_mcbs.zoo.sampler"
-    assert rl_zoo3.hyperparams_opt.HYPERPARAMS_CONVERTER["mcbs_td3"].__module__ == "sb3_mcbs.zoo.sampler"
+    for name in ALGORITHMS:
+        sample = rl_zoo3.exp_manager.HYPERPARAMS_SAMPLER[name]
+        assert (sample.func, sample.args) == (sampler.sample_mcbs_params, (name.removeprefix("mcbs_"),))
+        assert rl_zoo3.hyperparams_opt.HYPERPARAMS_CONVERTER[name] is sampler.convert_mcbs_params
     for module in (rl_zoo3.exp_manager, rl_zoo3.train, rl_zoo3.enjoy):
         assert module.ExperimentManager is MCBSExperimentManager
     assert MCBSExperimentManager.__base__.__module__ == "rl_zoo3.exp_manager"
@@ -59,12 +67,84 @@ def test_register_reaches_commands_that_were_imported_before() -> None:
     assert rl_zoo3.train.ExperimentManager is MCBSExperimentManager
 
 
+class Loaded(Exception):
+    """Ends a command as soon as it has its agent."""
+
+
+@pytest.fixture
+def saved_run(make_agent, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Put an agent with a large buffer where RL Zoo's commands find it, and end them when they load it."""
+
+    def save(algo: str) -> list[str]:
+        run = tmp_path / "logs" / algo / "Pendulum-v1_1"
+        (run / "Pendulum-v1").mkdir(parents=True)
+        (run / "Pendulum-v1" / "config.yml").write_text("{}")
+        make_agent(cls=ALGORITHMS[algo], buffer_size=50_000).save(run / "Pendulum-v1.zip")
+        return ["--algo", algo, "--env", "Pendulum-v1", "-f", str(tmp_path / "logs"), "--no-render"]
+
+    original = MCBS.load.__func__  # type: ignore[attr-defined]
+
+    def load(cls: type[MCBS], *args, **kwargs):
+        raise Loaded(original(cls, *args, **kwargs))
+
+    monkeypatch.setattr(MCBS, "load", classmethod(load))
+    return save
+
+
+@pytest.mark.parametrize(
+    ("command", "algo"),
+    [
+        *(("enjoy", algo) for algo in ALGORITHMS),
+        ("record_video", "mcbs_sac"),
+        ("push_to_hub", "mcbs_tqc"),
+    ],
+)
+def test_commands_that_show_an_agent_load_no_replay_buffer(
+    command: str, algo: str, saved_run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As ``python -m``, which runs a module's code without importing it."""
+    words = saved_run(algo)
+    if command == "push_to_hub":
+        words += ["-orga", "nobody"]
+        # Of the versions of huggingface_sb3, not all that RL Zoo accepts have what this command imports.
+        hub = importlib.import_module("huggingface_sb3.push_to_hub")
+        monkeypatch.setattr(hub, "generate_metadata", None, raising=False)
+    monkeypatch.delitem(sys.modules, f"rl_zoo3.{command}", raising=False)
+    monkeypatch.setattr(sys, "meta_path", [hook.ZooFinder(), *sys.meta_path])
+    monkeypatch.setattr(sys, "argv", [command, *words])
+    with pytest.raises(Loaded) as loaded:
+        runpy.run_module(f"rl_zoo3.{command}", run_name="__main__")
+    (agent,) = loaded.value.args
+    assert type(agent) is ALGORITHMS[algo]
+    assert agent.replay_buffer.buffer_size == agent.replay_buffer.observations.shape[0] == 1
+
+
+def test_imported_enjoy_loads_no_replay_buffer_without_the_hook(
+    saved_run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = saved_run("mcbs_td3")
+    monkeypatch.delitem(sys.modules, "rl_zoo3.enjoy", raising=False)
+    monkeypatch.setattr(sys, "meta_path", [f for f in sys.meta_path if type(f).__name__ != "ZooFinder"])
+    monkeypatch.setattr(sys, "argv", ["enjoy", *words])
+    enjoy = importlib.import_module("rl_zoo3.enjoy")
+    for n_rows in (50_000, 1):
+        with pytest.raises(Loaded) as loaded:
+            enjoy.enjoy()
+        assert loaded.value.args[0].replay_buffer.buffer_size == n_rows
+        register()
+    code = enjoy.enjoy.__code__
+    assert registration.with_our_off_policy_names(code) == code
+    assert {"dqn", "her", *ALGORITHMS} <= {
+        name for names in code.co_consts if isinstance(names, tuple) for name in names
+    }
+
+
 REPORT = """
 import sys
 {first}
 import rl_zoo3.train
 import rl_zoo3.exp_manager as e, rl_zoo3.hyperparams_opt as o
-print("mcbs_td3" in rl_zoo3.ALGOS, "mcbs_td3" in o.HYPERPARAMS_SAMPLER, "mcbs_td3" in o.HYPERPARAMS_CONVERTER,
+print("mcbs_sac" in rl_zoo3.ALGOS, "mcbs_td3" in o.HYPERPARAMS_SAMPLER, "mcbs_td3" in o.HYPERPARAMS_CONVERTER,
       rl_zoo3.train.ExperimentManager.__name__, e.EvalCallback.__name__, e.TrialEvalCallback.__name__)
 """
 REGISTERED = "True True True MCBSExperimentManager SearchEvalCallback SearchTrialEvalCallback"

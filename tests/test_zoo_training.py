@@ -11,6 +11,7 @@ from stable_baselines3.common.logger import Logger
 from sb3_mcbs import MCBSTD3, SearchPolicy, SnapshotEnvWrapper
 from sb3_mcbs.zoo.callbacks import RenamingLogger, SearchEvalCallback, SecondEvalCallback
 from sb3_mcbs.zoo.paths import sibling_folder
+from sb3_mcbs.zoo.registration import ALGORITHMS
 from sb3_mcbs.zoo.repeat import load_run
 from tests.zoo_helpers import TINY, TINY_SEARCH, evaluations, monitor_rewards, zoo_train
 
@@ -47,6 +48,19 @@ def test_both_policies_are_evaluated_where_rl_zoo_draws_them(mcbs_run: Path) -> 
         assert data["results"].shape == (2, 2)
         assert data["ep_lengths"].tolist() == [[200, 200]] * 2
     assert (with_search["results"] != actor["results"]).all()
+
+
+@pytest.mark.parametrize("algo", [name for name in ALGORITHMS if name != "mcbs_td3"])
+def test_every_algorithm_trains_and_is_evaluated_twice(
+    algo: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("-n", "210", "--eval-freq", "200", "--eval-episodes", "1", "--seed", "1")
+    zoo_train(monkeypatch, tmp_path, algo, *words, "-params", *TINY_SEARCH)
+    run = tmp_path / "logs" / algo / "Pendulum-v1_1"
+    assert load_run(run)[0]["env_wrapper"] == "sb3_mcbs.SnapshotEnvWrapper"
+    with_search, actor = evaluations(run), evaluations(sibling_folder(run, "actor"))
+    assert (with_search["results"] != actor["results"]).all()
+    assert ALGORITHMS[algo].load(run / "Pendulum-v1.zip").n_decisions == 110
 
 
 def test_each_evaluation_is_the_policy_it_claims_to_be(make_agent: Any, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""What ``-optimize`` tunes for ``mcbs_td3``, and what its objective is."""
+"""What ``-optimize`` tunes for our algorithms, and what its objective is."""
 
 import subprocess
 import sys
@@ -12,6 +12,7 @@ import pytest
 from sb3_mcbs import SearchPolicy
 from sb3_mcbs.search import SearchSettings
 from sb3_mcbs.zoo import sampler, train
+from sb3_mcbs.zoo.registration import ALGORITHMS
 from tests.zoo_helpers import TINY, zoo_train
 
 SEARCH = {"beam_width": 6, "rollout_depth": 3, "n_simulations": 5, "beam_noise": 0.1}
@@ -28,23 +29,30 @@ TD3 = {
 NO_HER = {"using_her_replay_buffer": False, "her_kwargs": {}}
 
 
-def sample(params: dict[str, Any]) -> dict[str, Any]:
-    return sampler.sample_mcbs_td3_params(optuna.trial.FixedTrial(params), 1, 1, dict(NO_HER))
+BASES = [name.removeprefix("mcbs_") for name in ALGORITHMS]
 
 
-def test_only_the_search_is_tuned_by_default(monkeypatch: pytest.MonkeyPatch) -> None:
+def sample(params: dict[str, Any], base: str = "td3") -> dict[str, Any]:
+    return sampler.sample_mcbs_params(base, optuna.trial.FixedTrial(params), 1, 1, dict(NO_HER))
+
+
+@pytest.mark.parametrize("base", BASES)
+def test_only_the_search_is_tuned_by_default(base: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(sampler.SWITCH, raising=False)
-    assert sample(SEARCH) == SEARCH
-    assert sampler.convert_mcbs_td3_params(SEARCH) == SEARCH
+    assert sample(SEARCH, base) == SEARCH
+    assert sampler.convert_mcbs_params(SEARCH) == SEARCH
 
 
+@pytest.mark.parametrize("base", ["td3", "ddpg"])
 @pytest.mark.parametrize("noise_type", ["normal", "ornstein-uhlenbeck", None])
-def test_everything_is_tuned_when_asked(noise_type: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_everything_is_tuned_when_asked(
+    base: str, noise_type: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv(sampler.SWITCH, "all")
     params = {**SEARCH, **TD3, "noise_type": noise_type}
-    sampled = sample(params)
+    sampled = sample(params, base)
     assert sampled["gamma"] == 0.98 and sampled["batch_size"] == 64 and sampled["beam_width"] == 6
-    converted = sampler.convert_mcbs_td3_params(params)
+    converted = sampler.convert_mcbs_params(params)
     noise = {key: converted.pop(key, None) for key in ("noise_type", "noise_std")}
     # RL Zoo makes the noise from its name and scale; without a name the file's noise stays, as in the trial.
     assert noise == ({"noise_type": None, "noise_std": None} if noise_type is None else
@@ -54,9 +62,42 @@ def test_everything_is_tuned_when_asked(noise_type: str | None, monkeypatch: pyt
     assert converted == sampled
 
 
+@pytest.mark.parametrize("base", ["sac", "tqc"])
+def test_everything_is_tuned_of_agents_with_quantiles_or_entropy(
+    base: str, make_agent: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(sampler.SWITCH, "all")
+    of_base = {key: value for key, value in TD3.items() if not key.startswith("noise")}
+    if base == "tqc":
+        of_base |= {"n_quantiles": 9, "top_quantiles_to_drop_per_net": 3}
+    sampled = sample({**SEARCH, **of_base}, base)
+    assert sampled == sampler.convert_mcbs_params({**SEARCH, **of_base})
+    agent = make_agent(cls=ALGORITHMS[f"mcbs_{base}"], **sampled)
+    assert (agent.gamma, agent.batch_size, agent.beam_width) == (0.98, 64, 6)
+    assert base == "sac" or (agent.critic.n_quantiles, agent.top_quantiles_to_drop_per_net) == (9, 3)
+
+
+def test_strategies_are_tuned_when_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(sampler.SWITCH, "strategies")
+    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
+    seen: dict[str, int] = {}
+    for _ in range(400):
+        trial = study.ask()
+        try:
+            params = sampler.sample_mcbs_params("td3", trial, 1, 1, dict(NO_HER))
+        except optuna.TrialPruned:
+            assert trial.user_attrs["pruned"]
+            continue
+        settings = SearchSettings(**params)
+        assert settings.simulated_steps(deterministic=False) <= sampler.MAX_SIMULATED_STEPS
+        assert sampler.convert_mcbs_params(trial.params) == params
+        seen[settings.strategy] = seen.get(settings.strategy, 0) + 1
+    assert set(seen) == set(sampler.STRATEGIES) and min(seen.values()) >= 5
+
+
 def test_unknown_scope_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(sampler.SWITCH, "td3")
-    with pytest.raises(ValueError, match="SB3_MCBS_TUNE must be one of search, all, got 'td3'"):
+    with pytest.raises(ValueError, match="SB3_MCBS_TUNE must be one of search, strategies, all, got 'td3'"):
         sample(SEARCH)
 
 

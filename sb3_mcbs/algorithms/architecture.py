@@ -102,7 +102,7 @@ def read_architecture(shapes: Mapping[str, Shape]) -> Architecture:
     critic = list(_widths(shapes, "critic.qf0"))
     if not critic or not (actor or stochastic):
         raise AgentFileError(
-            "The policy's tensors are not those of a TD3, DDPG, SAC, TQC or MCBSTD3 agent: these have "
+            "The policy's tensors are not those of a TD3, DDPG, SAC or TQC agent: these have "
             f"'actor.*' and 'critic.qf0.*'; the file has {str(sorted(shapes)[:4])[:200]}."
         )
     critic_indices = itertools.takewhile(lambda i: f"critic.qf{i}.0.weight" in shapes, itertools.count())

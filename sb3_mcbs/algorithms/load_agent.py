@@ -19,7 +19,11 @@ from stable_baselines3.common.type_aliases import GymEnv
 from sb3_mcbs.algorithms.agent_file import AgentFile, is_pickled, read_agent_file
 from sb3_mcbs.algorithms.architecture import Architecture, check_shapes, check_spaces, read_architecture
 from sb3_mcbs.algorithms.archive import AgentFileError
+from sb3_mcbs.algorithms.mcbs import MCBS
+from sb3_mcbs.algorithms.mcbs_ddpg import MCBSDDPG
+from sb3_mcbs.algorithms.mcbs_sac import MCBSSAC
 from sb3_mcbs.algorithms.mcbs_td3 import MCBSTD3
+from sb3_mcbs.algorithms.mcbs_tqc import MCBSTQC
 from sb3_mcbs.algorithms.network_settings import is_number, network_settings
 from sb3_mcbs.search import SearchSettings
 
@@ -31,8 +35,10 @@ ALGORITHMS: dict[str, type[OffPolicyAlgorithm]] = {
     "sac": SAC,
     "tqc": TQC,
     "mcbs_td3": MCBSTD3,
+    "mcbs_ddpg": MCBSDDPG,
+    "mcbs_sac": MCBSSAC,
+    "mcbs_tqc": MCBSTQC,
 }
-_STOCHASTIC = ("sac", "tqc")
 
 
 def load_agent(
@@ -54,9 +60,11 @@ def load_agent(
     the name of the entry or member, and logged (``sb3_mcbs``); what may change how the agent acts, as a
     warning.
 
-    :param path: the file, as ``save`` of TD3, DDPG, SAC, TQC or MCBSTD3 wrote it, with an ``MlpPolicy``
+    :param path: the file, as ``save`` of TD3, DDPG, SAC, TQC or one of their MCBS agents wrote it, with an
+        ``MlpPolicy``
     :param env: the environment to act in; its spaces must be those of the training
-    :param algo: ``"td3"``, ``"ddpg"``, ``"sac"``, ``"tqc"`` or ``"mcbs_td3"``; None: as the file says
+    :param algo: ``"td3"``, ``"ddpg"``, ``"sac"``, ``"tqc"``, or one of these after ``"mcbs_"``; None: as the
+        file says
     :param policy_kwargs: what the agent was trained with, for files that do not say it readably. Needed is
         what tensors do not tell: ``activation_fn``, with gSDE ``clip_mean`` and ``use_expln``.
     :param device: device on which the networks run
@@ -75,7 +83,7 @@ def load_agent(
         check_shapes(shapes, architecture, env.observation_space, env.action_space)
         name = _algorithm(file, architecture, algo)
         networks = network_settings(file.data, architecture, policy_kwargs)
-        if name == "tqc":
+        if issubclass(ALGORITHMS[name], TQC):
             networks["n_quantiles"] = architecture.n_outputs
         numbers, warnings = _numbers(file, name, architecture)
     warnings += _differing_bounds(file, env.action_space)
@@ -103,14 +111,15 @@ def _algorithm(file: AgentFile, architecture: Architecture, algo: str | None) ->
         if architecture.stochastic:
             is_tqc = architecture.n_outputs > 1 or "top_quantiles_to_drop_per_net" in file.data
             algo = "tqc" if is_tqc else "sac"
-        elif "beam_width" in file.data:
-            algo = "mcbs_td3"
         else:
             algo = "ddpg" if architecture.n_critics == 1 else "td3"
+        if "beam_width" in file.data:
+            algo = f"mcbs_{algo}"
     if algo not in ALGORITHMS:
         raise ValueError(f"algo must be one of {list(ALGORITHMS)}, got {algo!r}.")
-    one_output = architecture.n_outputs == 1 or algo == "tqc"
-    if architecture.stochastic != (algo in _STOCHASTIC) or not one_output:
+    cls = ALGORITHMS[algo]
+    one_output = architecture.n_outputs == 1 or issubclass(cls, TQC)
+    if architecture.stochastic != issubclass(cls, SAC | TQC) or not one_output:
         kind = "a stochastic" if architecture.stochastic else "a deterministic"
         raise AgentFileError(
             f"The file is not of the algorithm {algo!r}: it has {kind} actor and critics with "
@@ -130,14 +139,16 @@ def _numbers(file: AgentFile, algo: str, architecture: Architecture) -> tuple[di
     checks: dict[str, tuple[Callable[[Any], bool], str]] = {
         "gamma": (lambda value: is_number(value) and 0 < value <= 1, "a number above 0 and up to 1")
     }
-    if algo in _STOCHASTIC:
+    if issubclass(ALGORITHMS[algo], SAC | TQC):
         checks["ent_coef"] = (_is_entropy_coefficient, "a number from 0 or 'auto'")
-    if algo == "tqc":
+    if issubclass(ALGORITHMS[algo], TQC):
         checks["top_quantiles_to_drop_per_net"] = (
             lambda value: type(value) is int and 0 <= value < architecture.n_outputs,
             f"an integer from 0 to below the number of quantiles, {architecture.n_outputs}",
         )
-    settings = SearchSettings.names() if "beam_width" in file.data and algo == "mcbs_td3" else ()
+    settings = (
+        SearchSettings.names() if "beam_width" in file.data and issubclass(ALGORITHMS[algo], MCBS) else ()
+    )
     values, warnings = {}, []
     for name in (*checks, *settings):
         if name not in file.data or is_pickled(file.data[name]):
@@ -193,7 +204,7 @@ def _build(
     device: th.device | str,
     tensors: dict[str, th.Tensor],
 ) -> OffPolicyAlgorithm:
-    settings = numbers | ({"use_sde": use_sde} if cls in (SAC, TQC) else {})
+    settings = numbers | ({"use_sde": use_sde} if issubclass(cls, SAC | TQC) else {})
     agent = cls(
         "MlpPolicy",
         env,

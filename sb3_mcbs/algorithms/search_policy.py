@@ -8,7 +8,7 @@ import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-from sb3_mcbs.algorithms.mcbs_td3 import MCBSTD3
+from sb3_mcbs.algorithms.mcbs import MCBS
 from sb3_mcbs.algorithms.searcher import Searcher
 from sb3_mcbs.search import SearchResult, SearchSettings
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
@@ -27,15 +27,16 @@ class SearchPolicy:
     SAC and TQC propose their mean action; TQC's value is the mean over all quantiles of all critics.
     Attributes that this class does not have are those of the agent (``save``, ``get_env``, ``logger``, ...).
 
-    :param model: a TD3, DDPG, SAC, TQC or MCBSTD3 agent
+    :param model: a TD3, DDPG, SAC or TQC agent, or one that searched in training (
+        :class:`~sb3_mcbs.MCBS`)
     :param vec_env: the environment to act in, at most wrapped further by ``VecEnv`` wrappers that alter
         nothing. Environments in this process are wrapped for snapshots in place. A ``gym.Env`` must be
         wrapped in :class:`~sb3_mcbs.SnapshotEnvWrapper` outermost.
     :param seed: seed of the search's own generator; None: a fresh one
     :param normalize_reward: whether the critics were trained on rewards that ``VecNormalize`` scaled.
         None: found out from the environment that the agent was trained in, or assumed from the statistics
-    :param search_settings: the fields of :class:`~sb3_mcbs.SearchSettings`; those not given are an
-        MCBSTD3 agent's own, or the defaults
+    :param search_settings: the fields of :class:`~sb3_mcbs.SearchSettings`; those not given are
+        those that the agent trained with, or the defaults
     """
 
     def __init__(
@@ -51,7 +52,7 @@ class SearchPolicy:
             raise TypeError(f"Unknown search settings {unknown}; known are {list(SearchSettings.names())}.")
         if normalize_reward is not None and not isinstance(normalize_reward, bool):
             raise TypeError(f"normalize_reward must be True, False or None, got {normalize_reward!r}.")
-        settings = model.search_settings if isinstance(model, MCBSTD3) else SearchSettings()
+        settings = model.search_settings if isinstance(model, MCBS) else SearchSettings()
         self.model = model
         self.settings = replace(settings, **search_settings)
         self.vec_env = _as_vec_env(vec_env)

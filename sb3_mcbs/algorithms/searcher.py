@@ -19,12 +19,15 @@ from sb3_mcbs.models.base import Observations
 from sb3_mcbs.models.copies import stack
 from sb3_mcbs.search import (
     Agent,
+    Decision,
+    Moment,
     Pace,
+    PlanMemory,
     SearchResult,
     SearchSettings,
-    beam_search,
+    check_dynamics,
     deadline_search,
-    draw_noise,
+    search,
 )
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 
@@ -40,6 +43,7 @@ class Searcher:
     :param normalize_reward: see :class:`~sb3_mcbs.SearchPolicy`.
     :raises SnapshotUnsupportedError: if an environment's state cannot be captured.
     :raises ForwardModelError: if the requested forward model cannot simulate the environments.
+    :raises ValueError: if the settings make no sense with the environments' random dynamics.
     """
 
     def __init__(
@@ -60,11 +64,15 @@ class Searcher:
         self.model: ForwardModel | None = None
         self._previous_step_differed = False
         self._pace = Pace()
+        self._plans: PlanMemory | None = None
         if settings.rollout_depth > 0:
             self.view = VecEnvView(vec_env, reward_normalizer(agent.get_env(), vec_env, normalize_reward))
             self.environments: Environments = snapshot_environments(self.view.base)
             self._env_indices = range(len(self.environments))
             self.model = make_forward_model(self.environments, settings.forward_model, settings.n_threads)
+            check_dynamics(settings, self.model.deterministic)
+            if settings.strategy == "refine":
+                self._plans = PlanMemory(len(self.environments), settings.rollout_depth, self._act_dim)
         self._functions = self._agent_functions()
 
     @property
@@ -91,8 +99,11 @@ class Searcher:
         agent, settings = self.agent_functions(), self.settings
         with one_thread(), matmul_precision(settings.matmul_precision):
             if settings.time_budget is None:
-                noise = draw_noise(rng, settings, _n_rows(observations), self._act_dim)
-                result = beam_search(self.model, roots, observations, agent, settings, noise, rng)
+                shape = (_n_rows(observations), self._act_dim)
+                decision = Decision(self.model, roots, observations, agent, settings, shape, rng)
+                if self._plans is not None:
+                    decision = decision._replace(memory=self._plans, moments=self._moments())
+                result = search(decision)
             else:
                 assert self.model is not None
                 deadline = start + settings.time_budget
@@ -148,6 +159,7 @@ class Searcher:
             "kind": None if model is None else model.kind,
             "deterministic": None if model is None else model.deterministic,
             "previous_step_differed": self._previous_step_differed,
+            "plans": None if self._plans is None else self._plans.state(self._moments()),
         }
 
     @memory.setter
@@ -155,6 +167,8 @@ class Searcher:
         self._previous_step_differed = memory["previous_step_differed"]
         if self.model is None:
             return
+        if self._plans is not None and memory.get("plans") is not None:
+            self._plans.set_state(memory["plans"], self._moments())
         if self.model.kind != memory["kind"]:
             self.model.close()
             self.model = make_forward_model(self.environments, memory["kind"], self.settings.n_threads)
@@ -217,6 +231,9 @@ class Searcher:
             )
         return stacked
 
+    def _moments(self) -> list[Moment]:
+        return self.environments.apply(self._env_indices, _moment)
+
     def _read_roots(self) -> list[Any]:
         assert self.model is not None
         try:
@@ -230,11 +247,13 @@ class Searcher:
 
         :param message: what was noticed, for the warning.
         :raises ForwardModelError: if the forward model that was asked for cannot follow.
+        :raises ValueError: if the settings make no sense with random dynamics.
         """
         assert self.model is not None
         if self.model.kind == "pool":
             self.model.deterministic = False
             self._warn(message + "Its dynamics are random; every simulation now draws its own randomness.")
+            check_dynamics(self.settings, deterministic=False)
             return
         if not self._previous_step_differed:
             try:
@@ -280,6 +299,10 @@ def _check_networks(agent: Agent, observations: Observations) -> None:
 
 def _last_observation(env: SnapshotEnvWrapper) -> Any:
     return env.last_observation
+
+
+def _moment(env: SnapshotEnvWrapper) -> Moment:
+    return env.moment
 
 
 def _row(observations: Observations, index: int) -> Any:

@@ -6,6 +6,7 @@ and step Adam and the target networks one tensor at a time. Random numbers are d
 so both give the same networks up to float32 rounding.
 """
 
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -18,6 +19,8 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch import nn
 
 from sb3_mcbs.algorithms.networks import actor_mlp, critic_mlps
+
+logger = logging.getLogger("sb3_mcbs")
 
 
 class TD3Update:
@@ -131,6 +134,51 @@ class TD3Update:
         for targets, networks in self._targets_and_networks:
             th._foreach_mul_(targets, 1 - self._agent.tau)
             th._foreach_add_(targets, networks, alpha=self._agent.tau)
+
+
+class FastUpdate(TD3):
+    """
+    TD3, or a subclass of it, whose gradient steps are those of :class:`TD3Update` where they can be.
+
+    A subclass's constructor sets :attr:`fast_update` before the networks are set up.
+    """
+
+    #: Whether to; ``False`` leaves gradient steps to SB3.
+    fast_update: bool
+    _update: TD3Update | None = None
+
+    def _setup_model(self) -> None:
+        if not isinstance(self.fast_update, bool):
+            raise TypeError(f"fast_update must be True or False, got {self.fast_update!r}.")
+        super()._setup_model()
+        self._update = self._make_update()
+
+    def _make_update(self) -> TD3Update | None:
+        if not self.fast_update:
+            return None
+        try:
+            return TD3Update(self)
+        except TypeError as reason:
+            message = f"Gradient steps are SB3's own, not the fast ones: {reason}."
+            logger.info(message)
+            if self.verbose >= 1:
+                print(message)
+            return None
+
+    def train(self, gradient_steps: int, batch_size: int = 100) -> None:
+        """
+        Update the networks as SB3 does.
+
+        :param gradient_steps: how many gradient steps to do
+        :param batch_size: transitions sampled for each
+        """
+        if self._update is None:
+            super().train(gradient_steps, batch_size)
+        else:
+            self._update.train(gradient_steps, batch_size)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_update"]
 
 
 def _check_optimizer(network: nn.Module) -> None:

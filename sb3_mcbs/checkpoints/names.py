@@ -18,12 +18,12 @@ from stable_baselines3.her.goal_selection_strategy import GoalSelectionStrategy
 from stable_baselines3.sac import policies as sac_policies
 from stable_baselines3.td3 import policies as td3_policies
 
-from sb3_mcbs.algorithms import MCBSTD3
+from sb3_mcbs.algorithms import MCBSDDPG, MCBSSAC, MCBSTD3, MCBSTQC
 from sb3_mcbs.checkpoints.encoding import name_of
 from sb3_mcbs.snapshot.functions import FunctionName
 
 #: Agents whose whole state is known.
-AGENTS = (MCBSTD3, TD3, DDPG, SAC, TQC)
+AGENTS = (MCBSTD3, MCBSDDPG, MCBSSAC, MCBSTQC, TD3, DDPG, SAC, TQC)
 
 _CLASSES: tuple[type, ...] = (
     np.float32, np.float64, np.int32, np.int64, np.uint8, np.bool_,

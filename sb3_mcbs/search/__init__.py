@@ -1,17 +1,27 @@
 """Search over a forward model: proposing candidates, rolling them out, scoring, selecting."""
 
-from sb3_mcbs.search.beam import Agent, FirstStep, Noise, SearchResult, beam_search, draw_noise
+from sb3_mcbs.search.beam import beam_search
 from sb3_mcbs.search.deadline import Pace, deadline_search
-from sb3_mcbs.search.settings import SearchSettings
+from sb3_mcbs.search.interface import Agent, FirstStep, SearchResult
+from sb3_mcbs.search.memory import Moment, PlanMemory
+from sb3_mcbs.search.proposals import Noise, draw_noise
+from sb3_mcbs.search.settings import PRESETS, SearchSettings
+from sb3_mcbs.search.strategies import Decision, check_dynamics, search
 
 __all__ = [
+    "PRESETS",
     "Agent",
+    "Decision",
     "FirstStep",
+    "Moment",
     "Noise",
     "Pace",
+    "PlanMemory",
     "SearchResult",
     "SearchSettings",
     "beam_search",
+    "check_dynamics",
     "deadline_search",
     "draw_noise",
+    "search",
 ]

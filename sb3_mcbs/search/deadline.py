@@ -8,16 +8,9 @@ from typing import Any
 import numpy as np
 
 from sb3_mcbs.models.base import ForwardModel, Observations
-from sb3_mcbs.search.beam import (
-    Agent,
-    FirstStep,
-    OutOfTimeError,
-    SearchResult,
-    choose,
-    draw_noise,
-    propose,
-    rollout_values,
-)
+from sb3_mcbs.search.beam import OutOfTimeError, choose, join_rounds, rollout_values
+from sb3_mcbs.search.interface import Agent, FirstStep, SearchResult
+from sb3_mcbs.search.proposals import draw_noise, propose
 from sb3_mcbs.search.settings import SearchSettings
 
 #: How many past durations a forecast looks at, and which share of them it covers: of rounds, and of single
@@ -214,7 +207,7 @@ def deadline_search(
         policy_actions,
         np.concatenate(candidates, axis=1),
         np.concatenate(values, axis=1),
-        _merge(first_steps, n_envs),
+        join_rounds(first_steps, n_envs),
         simulated_steps,
     )
     pace.ending.note(pace.clock() - start)
@@ -234,19 +227,3 @@ def _policy_alone(policy_actions: np.ndarray, simulated_steps: int) -> SearchRes
         invalid_rollouts=0,
         rounds=0,
     )
-
-
-def _merge(first_steps: list[FirstStep], n_envs: int) -> FirstStep:
-    """Put the first steps of several rounds, each ``[n_envs * width]``, into the order of one."""
-
-    def join(arrays: list[Any]) -> np.ndarray:
-        by_env = [array.reshape(n_envs, -1, *array.shape[1:]) for array in arrays]
-        return np.concatenate(by_env, axis=1).reshape(-1, *arrays[0].shape[1:])
-
-    seen: list[Any] = [step.observations for step in first_steps]
-    observations = (
-        {key: join([one[key] for one in seen]) for key in seen[0]}
-        if isinstance(seen[0], dict)
-        else join(seen)
-    )
-    return FirstStep(observations, join([step.rewards for step in first_steps]))

@@ -17,11 +17,12 @@ MAX_STEPS = 10_000_000
 MAX_NOISE = 1e6
 MAX_THREADS = 1024
 MATMUL_PRECISIONS = ("highest", "high", "medium")
+STRATEGIES = ("beam", "tree", "refine")
 
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """Settings of Monte Carlo Beam Search (Algorithm 1).
+    """Settings of a search: Monte Carlo Beam Search (Algorithm 1) unless ``strategy`` says otherwise.
 
     :param beam_width: number of candidate actions per decision (``B``).
     :param rollout_depth: simulated steps per rollout (``D``). 0 ranks the candidates by the critics
@@ -46,6 +47,21 @@ class SearchSettings:
         the machine is. ``None``: all candidates, however long it takes, and reproducible to the bit.
     :param max_beam_width: with ``time_budget``, the number of candidates that is enough; ``None``:
         ``beam_width``, which may be left idle time.
+    :param strategy: ``"beam"`` (Algorithm 1), ``"tree"`` (the best ``beam_width`` nodes of every depth grow
+        ``branching`` children each) or ``"refine"`` (``n_rounds`` of ``beam_width`` plans, each round around
+        the best so far).
+    :param n_proposals: actions that are drawn, of which the critics choose those that are simulated.
+        ``None``: all that are drawn are simulated.
+    :param common_noise: whether all candidates (in a tree: all nodes of a depth) share the noise of their
+        later actions.
+    :param antithetic: whether noise comes in pairs of opposite sign, of candidates and of the simulations of
+        one candidate.
+    :param branching: children of a node in a tree.
+    :param one_node_per_root: whether a tree keeps only the best node of each root action.
+    :param n_rounds: rounds of a refinement.
+    :param n_elites: the best plans that a round of a refinement goes on from. ``None``: a quarter of
+        ``beam_width``.
+    :param min_noise: what the spread of a refinement does not fall below, in the scaled action space.
     :raises TypeError: if a value has the wrong type.
     :raises ValueError: if a value is out of range.
     """
@@ -62,43 +78,68 @@ class SearchSettings:
     matmul_precision: str | None = None
     time_budget: float | None = None
     max_beam_width: int | None = None
+    strategy: str = "beam"
+    n_proposals: int | None = None
+    common_noise: bool = False
+    antithetic: bool = False
+    branching: int = 5
+    one_node_per_root: bool = False
+    n_rounds: int = 3
+    n_elites: int | None = None
+    min_noise: float = 0.02
 
     def __post_init__(self) -> None:
         self._set_integer("beam_width", 1, MAX_ROLLOUTS)
         self._set_integer("rollout_depth", 0, MAX_DEPTH)
         self._set_integer("n_simulations", 1, MAX_ROLLOUTS)
         self._set_integer("n_threads", 0, MAX_THREADS)
-        self._set_number("beam_noise", MAX_NOISE)
-        if self.rollout_noise is not None:
-            self._set_number("rollout_noise", MAX_NOISE)
-        if self.noise_clip is not None:
-            self._set_number("noise_clip", MAX_NOISE)
-        if not isinstance(self.include_policy_action, bool):
-            raise TypeError(
-                f"include_policy_action must be True or False, got {self.include_policy_action!r}."
-            )
-        # Names are compared as strings only: an array, say, has no answer to whether it is in a tuple.
-        if not isinstance(self.forward_model, str) or self.forward_model not in KINDS:
-            raise ValueError(f"forward_model must be one of {KINDS}, got {self.forward_model!r}.")
-        precision = self.matmul_precision
-        if precision is not None and not (isinstance(precision, str) and precision in MATMUL_PRECISIONS):
-            raise ValueError(
-                f"matmul_precision must be one of {MATMUL_PRECISIONS} or None, got {self.matmul_precision!r}."
-            )
+        self._set_integer("branching", 1, MAX_ROLLOUTS)
+        self._set_integer("n_rounds", 1, MAX_ROLLOUTS)
+        for name in ("beam_noise", "min_noise"):
+            self._set_number(name, MAX_NOISE)
+        for name in ("rollout_noise", "noise_clip"):
+            if getattr(self, name) is not None:
+                self._set_number(name, MAX_NOISE)
+        if self.n_elites is not None:
+            self._set_integer("n_elites", 1, self.beam_width)
+        for name in ("include_policy_action", "common_noise", "antithetic", "one_node_per_root"):
+            if not isinstance(getattr(self, name), bool):
+                raise TypeError(f"{name} must be True or False, got {getattr(self, name)!r}.")
+        self._check_name("forward_model", KINDS)
+        self._check_name("strategy", STRATEGIES)
+        if self.matmul_precision is not None:
+            self._check_name("matmul_precision", MATMUL_PRECISIONS, "None")
 
+        self._check_strategy()
+        self._check_proposals()
+        self._check_common_noise()
         self._check_budget()
-        self._check_size("max_beam_width" if self.max_beam_width is not None else "beam_width")
+        self._check_size()
 
-    def _check_size(self, width_name: str) -> None:
-        rollouts = getattr(self, width_name) * self.n_simulations
+    def _check_name(self, setting: str, known: tuple[str, ...], *others: str) -> None:
+        value = getattr(self, setting)
+        # Names are compared as strings only: an array, say, has no answer to whether it is in a tuple.
+        if not isinstance(value, str) or value not in known:
+            allowed = " or ".join([str(known), *others])
+            raise ValueError(f"{setting} must be one of {allowed}, got {value!r}.")
+
+    def _check_size(self) -> None:
+        factors = ["beam_width", "n_simulations"]
+        if self.max_beam_width is not None:
+            factors[0] = "max_beam_width"
+        if self.strategy == "tree":
+            factors[:1] = ["beam_width", "branching"] if self.n_proposals is None else ["n_proposals"]
+        elif self.strategy == "refine":
+            factors[:1] = ["beam_width" if self.n_proposals is None else "n_proposals", "n_rounds"]
+        rollouts = math.prod(getattr(self, name) for name in factors)
         if rollouts > MAX_ROLLOUTS:
             raise ValueError(
-                f"{width_name} * n_simulations is {rollouts} rollouts per environment; at most "
+                f"{' * '.join(factors)} is {rollouts} rollouts per environment; at most "
                 f"{MAX_ROLLOUTS} are supported."
             )
         if rollouts * self.rollout_depth > MAX_STEPS:
             raise ValueError(
-                f"{width_name} * n_simulations * rollout_depth is {rollouts * self.rollout_depth} steps per "
+                f"{' * '.join(factors)} * rollout_depth is {rollouts * self.rollout_depth} steps per "
                 f"environment; at most {MAX_STEPS} are supported."
             )
 
@@ -110,10 +151,74 @@ class SearchSettings:
                     f"time_budget must be above 0 seconds, and needs a rollout_depth of 1 or more; got "
                     f"{self.time_budget} with rollout_depth={self.rollout_depth}."
                 )
+            if self.strategy != "beam":
+                raise ValueError(
+                    f"time_budget works with strategy='beam' only, got strategy={self.strategy!r}."
+                )
+            for name in ("n_proposals", "common_noise", "antithetic"):
+                if getattr(self, name):
+                    raise ValueError(
+                        f"time_budget evaluates candidates in rounds, which {name} does not: leave one of "
+                        "the two out."
+                    )
         if self.max_beam_width is not None:
             self._set_integer("max_beam_width", self.beam_width, MAX_ROLLOUTS)
             if self.time_budget is None:
                 raise ValueError("max_beam_width needs a time_budget; without one set beam_width.")
+
+    def _check_strategy(self) -> None:
+        if self.strategy == "beam":
+            return
+        chosen = f"strategy={self.strategy!r}"
+        if self.rollout_depth == 0:
+            raise ValueError(f"{chosen} needs a rollout_depth of 1 or more; got 0.")
+        if not self._is_noisy(self.beam_noise):
+            raise ValueError(
+                f"{chosen} needs a beam_noise above 0, and a noise_clip above 0 if it is set: all "
+                "candidates would be the same."
+            )
+        if self.strategy == "refine" and self.beam_width == 1:
+            raise ValueError(f"{chosen} needs a beam_width of 2 or more; got 1.")
+        is_deep = self.strategy == "tree" and self.rollout_depth > 1 and self.branching > 1
+        if is_deep and not self._is_noisy(self.effective_rollout_noise):
+            raise ValueError(
+                f"{chosen} needs a rollout_noise above 0 (None: as beam_noise), or branching=1: all children "
+                "of a node would be the same."
+            )
+
+    def _check_proposals(self) -> None:
+        if self.n_proposals is None:
+            return
+        per_environment = self.beam_width * (self.branching if self.strategy == "tree" else 1)
+        self._set_integer("n_proposals", min(per_environment, MAX_ROLLOUTS), MAX_ROLLOUTS)
+        if self.rollout_depth == 0:
+            raise ValueError(
+                "n_proposals needs a rollout_depth of 1 or more: with 0 the critics rank all candidates "
+                "anyway, and beam_width is their number."
+            )
+        if self.strategy == "tree" and self.n_proposals % self.beam_width:
+            raise ValueError(
+                f"n_proposals must be a multiple of beam_width={self.beam_width} with strategy='tree', since "
+                f"each node proposes equally many; got {self.n_proposals}."
+            )
+
+    def _check_common_noise(self) -> None:
+        if not self.common_noise:
+            return
+        if self.strategy == "refine":
+            raise ValueError(
+                "common_noise has no meaning with strategy='refine': later actions are part of the plan."
+            )
+        # The last action of a rollout has noise too, but a tree's leaves have no later actions.
+        steps = self.rollout_depth - (self.strategy == "tree")
+        if steps == 0 or not self._is_noisy(self.effective_rollout_noise):
+            raise ValueError(
+                "common_noise shares the noise of later actions; there is none with this rollout_depth, "
+                "rollout_noise and noise_clip: leave it out."
+            )
+
+    def _is_noisy(self, spread: float) -> bool:
+        return spread > 0 and self.noise_clip != 0
 
     def _set_integer(self, name: str, low: int, high: int) -> None:
         value = getattr(self, name)
@@ -142,6 +247,49 @@ class SearchSettings:
         """Standard deviation of the noise on the later actions of a rollout."""
         return self.beam_noise if self.rollout_noise is None else self.rollout_noise
 
+    @property
+    def effective_n_elites(self) -> int:
+        """The best plans that a refinement goes on from."""
+        return max(1, self.beam_width // 4) if self.n_elites is None else self.n_elites
+
+    def distinct_simulations(self, deterministic: bool) -> int:
+        """How many simulations of a candidate can differ from one another.
+
+        :param deterministic: whether the environment's steps are.
+        :return: ``n_simulations``, or 1 where nothing is random.
+        """
+        # Only Algorithm 1 draws the later actions of each simulation anew.
+        noisy = self.strategy == "beam" and self.effective_rollout_noise > 0
+        return self.n_simulations if noisy or not deterministic else 1
+
+    def simulated_steps(self, deterministic: bool = True) -> int:
+        """The most environment steps that a decision simulates, per environment.
+
+        :param deterministic: whether the environment's steps are.
+        :return: steps; fewer are simulated where rollouts terminate.
+        """
+        depth, simulations = self.rollout_depth, self.distinct_simulations(deterministic)
+        width = self.max_beam_width or self.beam_width
+        if self.strategy == "tree":
+            return width * self.branching * simulations * depth
+        if self.strategy == "refine":
+            return self.n_rounds * width * simulations * depth
+        first = min(depth, 1) if deterministic else min(depth, 1) * simulations
+        return width * (first + max(depth - 1, 0) * simulations)
+
+    @classmethod
+    def preset(cls, name: str, **changes: Any) -> "SearchSettings":
+        """Settings for an effort, by name.
+
+        :param name: one of :data:`PRESETS`.
+        :param changes: settings that shall differ from the preset.
+        :return: the settings.
+        :raises ValueError: if there is no preset of that name.
+        """
+        if not isinstance(name, str) or name not in PRESETS:
+            raise ValueError(f"There is no preset {name!r}; known are {', '.join(PRESETS)}.")
+        return cls(**{**PRESETS[name], **changes})
+
     @classmethod
     def names(cls) -> tuple[str, ...]:
         """Names of all settings, in the order of the constructor."""
@@ -151,7 +299,30 @@ class SearchSettings:
     def of(cls, agent: Any) -> "SearchSettings":
         """Read the settings that an agent carries as attributes.
 
-        :param agent: an object that has every setting as an attribute, such as ``MCBSTD3``.
+        :param agent: an object that has settings as attributes, such as ``MCBSTD3``; those that it lacks have
+            their defaults.
         :return: the checked settings.
         """
-        return cls(**{name: getattr(agent, name) for name in cls.names()})
+        # An agent that was saved before a setting existed searches as if it had its default.
+        values: dict[str, Any] = {
+            field.name: getattr(agent, field.name, field.default) for field in fields(cls)
+        }
+        return cls(**values)
+
+
+#: The settings that presets change, by the names of the presets. Around trained agents in deterministic
+#: environments "efficient", "balanced" and "strong" simulate about 20, 110 and 580 steps per decision.
+PRESETS: dict[str, dict[str, Any]] = {
+    "paper": {},
+    "efficient": dict(n_simulations=1, rollout_noise=0.0, include_policy_action=True),
+    "balanced": dict(strategy="refine", beam_width=12, n_simulations=1, antithetic=True),
+    "strong": dict(
+        strategy="refine",
+        beam_width=24,
+        n_rounds=4,
+        n_elites=4,
+        rollout_depth=6,
+        n_simulations=1,
+        antithetic=True,
+    ),
+}

@@ -55,6 +55,8 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
 
     #: What the last reset or step returned, None before the first reset. Not to be altered.
     last_observation: Any
+    #: How often the environment was reset or restored, and the steps since then. Not part of snapshots.
+    moment: tuple[int, int]
 
     def __new__(cls, env: Any = None) -> "SnapshotEnvWrapper":
         if isinstance(env, SnapshotEnvWrapper):
@@ -67,6 +69,7 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
         gym.utils.RecordConstructorArgs.__init__(self)
         gym.Wrapper.__init__(self, env)
         self.last_observation = None
+        self.moment = (0, 0)
         self._spaces = (describe_space(self.observation_space), describe_space(self.action_space))
         self._stack = Stack(self)
         # Whatever cannot be captured is better known before training than in the middle of it.
@@ -83,6 +86,7 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
         """
         observation, info = self.env.reset(seed=seed, options=options)
         self.last_observation = private_copy(observation)
+        self.moment = (self.moment[0] + 1, 0)
         self._stack.find_simulators()
         return observation, info
 
@@ -100,6 +104,7 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
             forget_the_past()
         result = self.env.step(action)
         self.last_observation = private_copy(result[0])
+        self.moment = (self.moment[0], self.moment[1] + 1)
         for diverged in watches:
             if diverged():
                 return diverged_step(result, self._stack.monitors)
@@ -137,6 +142,7 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
                 )
         self._stack.thaw(snapshot.layers, snapshot.nodes, rng)
         self.last_observation = private_copy(snapshot.last_observation)
+        self.moment = (self.moment[0] + 1, 0)
 
     def clone(self) -> "SnapshotEnvWrapper":
         """Make an independent copy of the environment in its present state.

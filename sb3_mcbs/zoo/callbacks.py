@@ -9,7 +9,7 @@ from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_mcbs.algorithms import MCBSTD3, SearchPolicy
+from sb3_mcbs.algorithms import MCBS, SearchPolicy
 
 
 class ActsWithSearch(EvalCallback):
@@ -19,7 +19,7 @@ class ActsWithSearch(EvalCallback):
         """
         :param model: the agent; saving and logging go to it, only the evaluated actions are searched
         """
-        if isinstance(model, MCBSTD3):
+        if isinstance(model, MCBS):
             super().init_callback(SearchPolicy(model, self.eval_env, seed=model.seed))  # type: ignore[arg-type]
         else:
             super().init_callback(model)

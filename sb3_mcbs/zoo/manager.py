@@ -46,10 +46,11 @@ class MCBSExperimentManager(ExperimentManager):
     """
     Finds this package's hyperparameter files and evaluates both policies of an agent.
 
-    For ``mcbs_td3`` the run folder's ``evaluations.npz`` is the agent with search, as it acts in training,
-    and the bare actor's goes to the sibling algorithm folder ``mcbs_td3_actor``. Another off-policy algorithm
-    whose hyperparameters contain ``search_evaluation`` (a dictionary of search settings) is evaluated as it
-    is in the run folder, and with search in the sibling folder ``ALGO_search``. All else is RL Zoo's.
+    For ``mcbs_td3`` and the other algorithms that search in training the run folder's ``evaluations.npz`` is
+    the agent with search, as it acts in training, and the bare actor's goes to the sibling algorithm folder
+    (``mcbs_td3_actor``). Another off-policy algorithm whose hyperparameters contain ``search_evaluation`` (a
+    dictionary of search settings) is evaluated as it is in the run folder, and with search in the sibling
+    folder ``ALGO_search``. All else is RL Zoo's.
 
     An ``ExactCheckpointCallback`` without a path writes into the run's folder.
 

@@ -9,7 +9,7 @@ def hyperparams_path(algo: str) -> Path:
     """
     Find the hyperparameter file of an algorithm, in an installed package or in a checkout.
 
-    :param algo: the algorithm's name on RL Zoo's command line, ``mcbs_td3`` or (our baseline) ``td3``
+    :param algo: the algorithm's name on RL Zoo's command line, ``mcbs_td3`` or (its baseline) ``td3``
     :return: path of its YAML file
     :raises FileNotFoundError: if this package has no file for the algorithm
     """

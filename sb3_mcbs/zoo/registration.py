@@ -8,21 +8,29 @@ Nothing here may import RL Zoo at the top: the hook calls from the middle of RL 
 import importlib
 import sys
 from collections.abc import Callable
-from types import ModuleType
+from functools import partial
+from types import CodeType, ModuleType
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_mcbs.algorithms import MCBSTD3
-from sb3_mcbs.zoo.sampler import convert_mcbs_td3_params, sample_mcbs_td3_params
+from sb3_mcbs.algorithms import MCBSDDPG, MCBSSAC, MCBSTD3, MCBSTQC
+from sb3_mcbs.zoo.sampler import convert_mcbs_params, sample_mcbs_params
 
 #: Our algorithms under their names on RL Zoo's command line.
-ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"mcbs_td3": MCBSTD3}
+ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
+    "mcbs_td3": MCBSTD3,
+    "mcbs_ddpg": MCBSDDPG,
+    "mcbs_sac": MCBSSAC,
+    "mcbs_tqc": MCBSTQC,
+}
+#: By these names, and others beside them, RL Zoo's commands know the algorithms that have a replay buffer.
+OFF_POLICY = frozenset(("ddpg", "sac", "td3", "tqc"))
 
 
 def register() -> None:
     """
-    Add this package to RL Zoo: ``mcbs_td3`` becomes an algorithm of its commands.
+    Add this package to RL Zoo: ``mcbs_td3`` and the others become algorithms of its commands.
 
     An installed package does this by itself as soon as ``rl_zoo3`` is imported; call it where the import hook
     is switched off. Calling it again changes nothing.
@@ -50,8 +58,10 @@ def _add_algorithms(utils: Any) -> None:
 
 
 def _add_samplers(hyperparams_opt: Any) -> None:
-    hyperparams_opt.HYPERPARAMS_SAMPLER["mcbs_td3"] = sample_mcbs_td3_params
-    hyperparams_opt.HYPERPARAMS_CONVERTER["mcbs_td3"] = convert_mcbs_td3_params
+    for name in ALGORITHMS:
+        base = name.removeprefix("mcbs_")
+        hyperparams_opt.HYPERPARAMS_SAMPLER[name] = partial(sample_mcbs_params, base)
+        hyperparams_opt.HYPERPARAMS_CONVERTER[name] = convert_mcbs_params
 
 
 def _add_manager(exp_manager: Any) -> None:
@@ -70,8 +80,33 @@ def _add_manager(exp_manager: Any) -> None:
             module.ExperimentManager = subclass  # type: ignore[union-attr]
 
 
+def with_our_off_policy_names(code: CodeType) -> CodeType:
+    """
+    Add our algorithms to those that a command of RL Zoo loads with a replay buffer of one row.
+
+    ``enjoy``, ``record_video`` and ``push_to_hub`` only show an agent. They hold the names of the algorithms
+    that have a replay buffer in a list within their code; there is no other place to add to.
+
+    :param code: of the command, or of one of its functions
+    :return: the same code with the longer list; unchanged if it has none, or ours is there
+    """
+    constants: list[Any] = []
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            constant = with_our_off_policy_names(constant)
+        elif isinstance(constant, tuple) and OFF_POLICY.issubset(constant):
+            constant = (*constant, *(name for name in ALGORITHMS if name not in constant))
+        constants.append(constant)
+    return code.replace(co_consts=tuple(constants))
+
+
+def _extend_enjoy(enjoy: Any) -> None:
+    enjoy.enjoy.__code__ = with_our_off_policy_names(enjoy.enjoy.__code__)
+
+
 _PATCHES: dict[str, Callable[[Any], None]] = {
     "rl_zoo3.utils": _add_algorithms,
     "rl_zoo3.hyperparams_opt": _add_samplers,
     "rl_zoo3.exp_manager": _add_manager,
+    "rl_zoo3.enjoy": _extend_enjoy,
 }

@@ -1,8 +1,9 @@
 """
-What ``-optimize`` draws for ``mcbs_td3``, and how a trial's parameters become constructor arguments.
+What ``-optimize`` draws for our algorithms, and how a trial's parameters become constructor arguments.
 
-By default only the search is tuned and the TD3 settings of the hyperparameter file are held, so that trials
-differ in one thing. ``SB3_MCBS_TUNE=all`` tunes RL Zoo's TD3 parameters as well.
+By default only the size and noise of the search are tuned and the other settings of the hyperparameter file
+are held, so that trials differ in one thing. ``SB3_MCBS_TUNE=strategies`` tunes how it searches as well,
+``SB3_MCBS_TUNE=all`` what RL Zoo tunes of the algorithm without search.
 """
 
 import os
@@ -10,33 +11,30 @@ from typing import Any
 
 import optuna
 
+from sb3_mcbs.search import SearchSettings
+
 SWITCH = "SB3_MCBS_TUNE"
-SCOPES = ("search", "all")
+SCOPES = ("search", "strategies", "all")
 
 BEAM_WIDTHS = (3, 6, 12, 18)
 ROLLOUT_DEPTHS = (0, 1, 2, 3, 4, 6)
 N_SIMULATIONS = (1, 3, 5, 10)
 BEAM_NOISE = (0.01, 0.5)
+STRATEGIES = ("beam", "tree", "refine")
+PROPOSAL_FACTORS = (1, 4, 8)
+BRANCHING = (2, 3, 5)
+N_ROUNDS = (2, 3, 4)
 
 #: A trial whose decisions cost more simulated steps than this would take days.
 MAX_SIMULATED_STEPS = 600
 
-#: The combinations that are pruned before anything is built: a test on the parameters, and the reason.
-INVALID_COMBINATIONS = (
-    (
-        lambda p: p["rollout_depth"] == 0 and p["n_simulations"] > 1,
-        "nothing is simulated at rollout_depth 0, so n_simulations above 1 repeats another trial",
-    ),
-    (
-        lambda p: p["beam_width"] * p["rollout_depth"] * p["n_simulations"] > MAX_SIMULATED_STEPS,
-        f"beam_width * rollout_depth * n_simulations is above {MAX_SIMULATED_STEPS}",
-    ),
-)
+#: What trials store of a strategy under names that are no settings themselves.
+_HELPERS = ("proposal_factor", "noise_free_rollouts")
 
 
 def tuning_scope() -> str:
     """
-    :return: ``search`` or ``all``, as the environment variable ``SB3_MCBS_TUNE`` says
+    :return: one of ``SCOPES``, as the environment variable ``SB3_MCBS_TUNE`` says
     :raises ValueError: if it says anything else
     """
     scope = os.environ.get(SWITCH) or "search"
@@ -45,53 +43,104 @@ def tuning_scope() -> str:
     return scope
 
 
-def sample_mcbs_td3_params(
-    trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
+def sample_mcbs_params(
+    base: str, trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
 ) -> dict[str, Any]:
     """
-    Sampler for MCBSTD3 hyperparameters.
+    Sampler for the hyperparameters of an agent that searches.
 
+    :param base: RL Zoo's name of the same algorithm without search
     :param trial: Optuna's trial
-    :param n_actions: number of entries of an action, for TD3's noise
+    :param n_actions: number of entries of an action, for the noise of TD3 and DDPG
     :param n_envs: number of training environments
     :param additional_args: what RL Zoo's samplers need to know of the replay buffer
     :return: constructor arguments
-    :raises optuna.TrialPruned: for a combination in ``INVALID_COMBINATIONS``
+    :raises optuna.TrialPruned: for settings that do not go together, or of too long a search
     """
-    params: dict[str, Any] = {
+    scope = tuning_scope()
+    sampled: dict[str, Any] = {
         "beam_width": trial.suggest_categorical("beam_width", BEAM_WIDTHS),
         "rollout_depth": trial.suggest_categorical("rollout_depth", ROLLOUT_DEPTHS),
         "n_simulations": trial.suggest_categorical("n_simulations", N_SIMULATIONS),
         "beam_noise": trial.suggest_float("beam_noise", *BEAM_NOISE, log=True),
     }
-    for is_invalid, reason in INVALID_COMBINATIONS:
-        if is_invalid(params):
-            trial.set_user_attr("pruned", reason)
-            raise optuna.TrialPruned(f"{reason}: {params}")
-    if tuning_scope() == "all":
-        from rl_zoo3.hyperparams_opt import sample_td3_params
+    if scope == "strategies":
+        sampled |= _sample_strategy(trial)
+    params = _search_settings(sampled)
+    reason = _why_senseless(params, sampled)
+    if reason is not None:
+        trial.set_user_attr("pruned", reason)
+        raise optuna.TrialPruned(f"{reason}: {params}")
+    if scope == "all":
+        from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
 
-        params.update(sample_td3_params(trial, n_actions, n_envs, additional_args))
+        params.update(HYPERPARAMS_SAMPLER[base](trial, n_actions, n_envs, additional_args))
     return params
 
 
-def convert_mcbs_td3_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
+def _sample_strategy(trial: optuna.Trial) -> dict[str, Any]:
+    """Draw how to search, by the names that the trial stores."""
+    strategy = trial.suggest_categorical("strategy", STRATEGIES)
+    sampled: dict[str, Any] = {
+        "strategy": strategy,
+        "antithetic": trial.suggest_categorical("antithetic", (False, True)),
+        "proposal_factor": trial.suggest_categorical("proposal_factor", PROPOSAL_FACTORS),
+    }
+    if strategy == "beam":
+        for name in ("noise_free_rollouts", "include_policy_action", "common_noise"):
+            sampled[name] = trial.suggest_categorical(name, (False, True))
+    elif strategy == "tree":
+        sampled["branching"] = trial.suggest_categorical("branching", BRANCHING)
+        sampled["one_node_per_root"] = trial.suggest_categorical("one_node_per_root", (False, True))
+    else:
+        sampled["n_rounds"] = trial.suggest_categorical("n_rounds", N_ROUNDS)
+    return sampled
+
+
+def _search_settings(sampled: dict[str, Any]) -> dict[str, Any]:
+    """Turn what a trial stores of the search into settings."""
+    settings = {name: value for name, value in sampled.items() if name not in _HELPERS}
+    if sampled.get("noise_free_rollouts"):
+        settings["rollout_noise"] = 0.0
+    if settings.get("strategy", "beam") != "beam":
+        settings["n_simulations"] = 1  # more are for random environments
+    if sampled.get("proposal_factor", 1) > 1:
+        n_kept = settings["beam_width"] * settings.get("branching", 1)
+        settings["n_proposals"] = sampled["proposal_factor"] * n_kept
+    return settings
+
+
+def _why_senseless(params: dict[str, Any], sampled: dict[str, Any]) -> str | None:
+    if params["rollout_depth"] == 0 and params["n_simulations"] > 1:
+        return "nothing is simulated at rollout_depth 0, so n_simulations above 1 repeats another trial"
+    if sampled["n_simulations"] > 1 and (params["n_simulations"] == 1 or params.get("rollout_noise") == 0):
+        return "n_simulations above 1 needs a beam with noise in its rollouts, else it repeats another trial"
+    try:
+        settings = SearchSettings(**params)
+    except ValueError as error:
+        return str(error)
+    if settings.simulated_steps(deterministic=False) > MAX_SIMULATED_STEPS:
+        return f"a decision would simulate more than {MAX_SIMULATED_STEPS} steps"
+    return None
+
+
+def convert_mcbs_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     """
     Turn the parameters that a trial stored back into constructor arguments.
 
     :param sampled_params: ``trial.params``
     :return: constructor arguments, as the sampler returned them
     """
-    search_names = ("beam_width", "rollout_depth", "n_simulations", "beam_noise")
-    search = {name: value for name, value in sampled_params.items() if name in search_names}
-    td3 = {name: value for name, value in sampled_params.items() if name not in search_names}
-    if not td3:
+    search_names = {*SearchSettings.names(), *_HELPERS}
+    search = _search_settings({name: v for name, v in sampled_params.items() if name in search_names})
+    others = {name: value for name, value in sampled_params.items() if name not in search_names}
+    if not others:
         return search
     from rl_zoo3.hyperparams_opt import convert_offpolicy_params
 
-    td3 = convert_offpolicy_params(td3)
-    if td3.get("noise_type", "") is None:
+    others = convert_offpolicy_params(others)
+    if others.get("noise_type", "") is None:
         # The trial ran with the file's noise then: RL Zoo's sampler gives no noise for None.
-        del td3["noise_type"]
-        td3.pop("noise_std", None)
-    return {**td3, **search}
+        del others["noise_type"]
+        others.pop("noise_std", None)
+    return {**others, **search}

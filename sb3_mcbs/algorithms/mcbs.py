@@ -1,0 +1,359 @@
+"""What makes an off-policy agent look ahead before it acts, whatever it learns by."""
+
+import inspect
+import time
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any, TypedDict, TypeVar
+
+import numpy as np
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+
+from sb3_mcbs.algorithms.faults import (
+    CheckedVecEnv,
+    check_observations,
+    diverged_environments,
+    environment_named,
+    leave_out_step,
+    warn_of_divergence,
+)
+from sb3_mcbs.algorithms.searcher import Searcher
+from sb3_mcbs.algorithms.torch_settings import matmul_precision
+from sb3_mcbs.search import SearchResult, SearchSettings
+
+SelfMCBS = TypeVar("SelfMCBS", bound="MCBS")
+
+_SEARCH_SETTINGS = "search_settings"
+
+
+class SearchKeywords(TypedDict, total=False):
+    """The fields of :class:`~sb3_mcbs.SearchSettings` as keyword arguments, for type checkers."""
+
+    beam_width: int
+    rollout_depth: int
+    n_simulations: int
+    beam_noise: float
+    rollout_noise: float | None
+    noise_clip: float | None
+    include_policy_action: bool
+    n_threads: int
+    forward_model: str
+    matmul_precision: str | None
+    time_budget: float | None
+    max_beam_width: int | None
+    strategy: str
+    n_proposals: int | None
+    common_noise: bool
+    antithetic: bool
+    branching: int
+    one_node_per_root: bool
+    n_rounds: int
+    n_elites: int | None
+    min_noise: float
+
+
+class MCBS(OffPolicyAlgorithm):
+    """
+    Monte Carlo Beam Search for an off-policy agent of SB3: the mixin that stands before it.
+
+    ::
+
+        class MCBSSAC(MCBS, SAC):
+            def __init__(self, policy, env, ..., **search_settings: Unpack[SearchKeywords]) -> None:
+                super().__init__(policy, env, ..., _init_setup_model=False)
+                self._init_search(action_noise_after_search, search_settings)
+                if _init_setup_model:
+                    self._setup_model()
+
+    A subclass keeps every search setting as an attribute, as SB3 does with its own. In the signature and the
+    docstring of such a class the settings are listed one by one where ``search_settings`` was written.
+    """
+
+    beam_width: int
+    rollout_depth: int
+    n_simulations: int
+    beam_noise: float
+    rollout_noise: float | None
+    noise_clip: float | None
+    include_policy_action: bool
+    n_threads: int
+    forward_model: str
+    matmul_precision: str | None
+    time_budget: float | None
+    max_beam_width: int | None
+    strategy: str
+    n_proposals: int | None
+    common_noise: bool
+    antithetic: bool
+    branching: int
+    one_node_per_root: bool
+    n_rounds: int
+    n_elites: int | None
+    min_noise: float
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        _list_search_settings(cls)
+
+    def _init_search(self, action_noise_after_search: bool, settings: Mapping[str, object]) -> None:
+        """
+        Take over the constructor's arguments for the search.
+
+        :param action_noise_after_search: add ``action_noise`` to searched actions too
+        :param settings: fields of :class:`~sb3_mcbs.SearchSettings`; those not given have their defaults
+        :raises TypeError: if there is no such setting
+        """
+        unknown = sorted(settings.keys() - set(SearchSettings.names()))
+        if unknown:
+            raise TypeError(
+                f"{type(self).__name__} got unexpected keyword arguments {unknown}; the settings of the "
+                f"search are {list(SearchSettings.names())}."
+            )
+        for field in fields(SearchSettings):
+            setattr(self, field.name, settings.get(field.name, field.default))
+        self.action_noise_after_search = action_noise_after_search
+
+        self.search_rng: np.random.Generator | None = None
+        self.n_decisions = 0
+        self.n_simulated_steps = 0
+        self.n_invalid_rollouts = 0
+        self.n_critic_evaluations = 0
+        self.n_diverged_steps = 0
+        self._searcher: Searcher | None = None
+        self._decision: SearchResult | None = None
+        self._checked_env: CheckedVecEnv | None = None
+
+    @property
+    def search_settings(self) -> SearchSettings:
+        """The settings of the search, checked."""
+        return SearchSettings.of(self)
+
+    def _setup_model(self) -> None:
+        # ``load`` sets attributes without calling the constructor, so settings are checked here.
+        settings = self.search_settings
+        if not isinstance(self.action_noise_after_search, bool):
+            raise TypeError(
+                f"action_noise_after_search must be True or False, got {self.action_noise_after_search!r}."
+            )
+        super()._setup_model()
+        if self.search_rng is None:
+            self.search_rng = np.random.default_rng(self.seed)
+        if self.env is not None:
+            self._make_searcher(self.env, settings)
+
+    def _make_searcher(self, env: VecEnv, settings: SearchSettings) -> None:
+        if self._searcher is not None:
+            self._searcher.close()
+        # What this environment's VecNormalize does is what the critics learn from.
+        normalizer = unwrap_vec_normalize(env)
+        normalize_reward = normalizer is not None and normalizer.norm_reward
+        self._searcher = Searcher(self, env, settings, normalize_reward)
+        if self.verbose >= 1:
+            print(f"Forward model: {self._searcher.description}")
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        super().set_env(env, force_reset)
+        assert self.env is not None
+        self._make_searcher(self.env, self.search_settings)
+
+    def set_random_seed(self, seed: int | None = None) -> None:
+        super().set_random_seed(seed)
+        if seed is not None:
+            self.search_rng = np.random.default_rng(seed)
+
+    def _sample_action(
+        self,
+        learning_starts: int,
+        action_noise: ActionNoise | None = None,
+        n_envs: int = 1,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Search for the next actions, or sample them as the agent without search before ``learning_starts``.
+
+        :param action_noise: noise for actions that were not searched
+        :param learning_starts: Number of steps before learning for the warm-up phase.
+        :param n_envs: number of environments
+        :return: actions ``[n_envs, *act_shape]`` to take in the environment
+            and scaled actions that will be stored in the replay buffer.
+        """
+        self._decision = None
+        if self.num_timesteps < learning_starts:
+            return super()._sample_action(learning_starts, action_noise, n_envs)
+
+        assert self._last_obs is not None, "self._last_obs was not set"
+        assert self._searcher is not None and self.search_rng is not None, "learn() needs an environment"
+        start = time.perf_counter()
+        result = self._searcher.search(self._last_obs, self.search_rng)
+        self._record_decision(result, time.perf_counter() - start)
+
+        scaled_action = result.actions.reshape(-1, *(self.action_space.shape or ()))
+        if self.action_noise_after_search and action_noise is not None:
+            noisy_action = np.clip(scaled_action + action_noise(), -1, 1).astype(scaled_action.dtype)
+            return self.policy.unscale_action(noisy_action), noisy_action
+        self._decision = result
+        return self.policy.unscale_action(scaled_action), scaled_action
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        diverged = diverged_environments(infos)
+        if diverged and self.n_diverged_steps == 0:
+            warn_of_divergence(buffer_action, diverged, self.num_timesteps)
+        self.n_diverged_steps += len(diverged)
+        self.logger.record("rollout/diverged_steps", self.n_diverged_steps)
+        if diverged:
+            leave_out_step(self, replay_buffer, new_obs)
+            return
+        if self._decision is not None:
+            assert self._searcher is not None
+            normalizer = self._vec_normalize_env
+            raw_reward = reward if normalizer is None else normalizer.get_original_reward()
+            error = self._searcher.model_error(self._decision, new_obs, raw_reward, infos)
+            if error is not None:
+                self.logger.record_mean("search/model_error", error)
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+
+    def collect_rollouts(self, env: VecEnv, *args: Any, **kwargs: Any) -> RolloutReturn:
+        if self._checked_env is None or self._checked_env.venv is not env:
+            self._checked_env = CheckedVecEnv(env)
+        return super().collect_rollouts(self._checked_env, *args, **kwargs)
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        result = super()._setup_learn(*args, **kwargs)
+        check_observations(self._last_obs)
+        return result
+
+    def train(self, gradient_steps: int, batch_size: int = 100) -> None:
+        """
+        Update the networks as the agent without search does.
+
+        :param gradient_steps: how many gradient steps to do
+        :param batch_size: transitions sampled for each
+        """
+        with matmul_precision(self.matmul_precision):
+            super().train(gradient_steps, batch_size)
+
+    def _record_decision(self, result: SearchResult, seconds: float) -> None:
+        n_envs = len(result.chosen)
+        self.n_decisions += n_envs
+        self.n_simulated_steps += result.simulated_steps
+        self.n_invalid_rollouts += result.invalid_rollouts
+        self.n_critic_evaluations += result.critic_evaluations
+        searched = result.chosen >= 0
+        values = result.values[searched]
+        if values.size and np.isfinite(values).all():
+            # In a tree the chosen root is that of the best leaf, which need not be the best root.
+            best = np.take_along_axis(values, result.chosen[searched][:, None], axis=1)[:, 0]
+            self.logger.record_mean("search/value_gain", float((best - values.mean(axis=1)).mean()))
+            self.logger.record_mean("search/beam_std", float(values.std(axis=1).mean()))
+        self.logger.record_mean("search/ms_per_decision", 1000 * seconds / n_envs)
+        if self.time_budget is not None:
+            self.logger.record_mean("search/rounds", result.rounds)
+            self.logger.record_mean("search/candidates", result.values.shape[1])
+        if result.surviving_roots is not None:
+            self.logger.record_mean("search/surviving_roots", float(result.surviving_roots.mean()))
+        self.logger.record("search/critic_evaluations", self.n_critic_evaluations)
+        self.logger.record("search/decisions", self.n_decisions)
+        self.logger.record("search/simulated_steps", self.n_simulated_steps)
+        self.logger.record("search/invalid_rollouts", self.n_invalid_rollouts)
+
+    def learn(
+        self: SelfMCBS,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfMCBS:
+        """
+        Return a trained model.
+
+        :param total_timesteps: The total number of samples (env steps) to train on
+        :param callback: callback(s) called at every step with state of the algorithm.
+        :param log_interval: episodes between logs
+        :param tb_log_name: the name of the run for TensorBoard logging; None: the name of the class
+        :param reset_num_timesteps: whether or not to reset the current timestep number (used in logging)
+        :param progress_bar: Display a progress bar using tqdm and rich.
+        :return: the trained model
+        """
+        assert self.env is not None, "learn() needs an environment: call set_env()"
+        if tb_log_name is None:
+            tb_log_name = type(self).__name__
+        with environment_named(self.env):
+            return super().learn(
+                total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
+            )
+
+    @classmethod
+    def resume(cls: type[SelfMCBS], path: str, env: GymEnv | None = None, **kwargs: Any) -> SelfMCBS:
+        """
+        Continue a run from its exact checkpoints, see :func:`sb3_mcbs.resume`.
+
+        :param path: the folder of checkpoints
+        :param env: the environment, made as the original one was; None makes it from its id
+        :param kwargs: the other arguments of :func:`sb3_mcbs.resume`
+        :return: the agent
+        :raises CheckpointError: if there is no whole checkpoint, or it is of another class
+        """
+        from sb3_mcbs.checkpoints.resume import resume_as
+
+        return resume_as(cls, path, env, **kwargs)
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """
+        Get the actor's action, **without search**. Use :class:`~sb3_mcbs.SearchPolicy` to act with search.
+
+        :param observation: the input observation
+        :param state: not used
+        :param episode_start: not used
+        :param deterministic: whether SAC and TQC take their mean action instead of a random one; the actors
+            of TD3 and DDPG are deterministic
+        :return: the actor's action and ``state``
+        """
+        return super().predict(observation, state, episode_start, deterministic)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_searcher", "_decision", "_checked_env"]
+
+
+def _list_search_settings(cls: type[MCBS]) -> None:
+    """Put the search settings one by one where the constructor has them as ``**search_settings``.
+
+    ``help``, :mod:`inspect` and exact checkpoints then see them like SB3's own parameters.
+
+    :param cls: changed in place; nothing is done for a class without that parameter.
+    """
+    init: Any = cls.__dict__.get("__init__")
+    signature = None if init is None else inspect.signature(init)
+    if signature is None or _SEARCH_SETTINGS not in signature.parameters:
+        return
+    listed = [
+        inspect.Parameter(
+            field.name, inspect.Parameter.KEYWORD_ONLY, default=field.default, annotation=field.type
+        )
+        for field in fields(SearchSettings)
+    ]
+    *others, _ = signature.parameters.values()
+    init.__signature__ = signature.replace(parameters=[*others, *listed])
+    if cls.__doc__ and SearchSettings.__doc__:  # there are none under ``python -OO``
+        before, _, _ = inspect.cleandoc(cls.__doc__).partition(f":param {_SEARCH_SETTINGS}:")
+        _, first, after = inspect.cleandoc(SearchSettings.__doc__).partition(":param ")
+        cls.__doc__ = before + first + after.partition(":raises ")[0]

@@ -1,0 +1,85 @@
+"""What goes into a search and what comes out, whatever the strategy.
+
+Arrays in, arrays out. Actions are scaled to [-1, 1] here, as a policy network gives them.
+Axes: ``n_envs`` environments, ``beam`` candidates, ``sim`` simulations, ``act_dim`` action entries.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from sb3_mcbs.models.base import Observations
+
+
+class Agent(NamedTuple):
+    """What a search has to know of the agent.
+
+    :param policy: observations ``[rows, ...]`` -> actions ``[rows, act_dim]`` in [-1, 1], without
+        exploration noise.
+    :param value: observations ``[rows, ...]``, scaled actions ``[rows, act_dim]`` -> the critics'
+        estimate of the return ``[rows]``, already the minimum over the critics.
+    :param gamma: discount factor per environment step.
+    :param unscale_action: scaled actions ``[rows, act_dim]`` -> actions of the environment.
+    :param scale_reward: rewards of the environment ``[rows]`` -> the scale that the critics know.
+    """
+
+    policy: Callable[[Observations], np.ndarray]
+    value: Callable[[Observations, np.ndarray], np.ndarray]
+    gamma: float
+    unscale_action: Callable[[np.ndarray], np.ndarray]
+    scale_reward: Callable[[np.ndarray], np.ndarray]
+
+
+class FirstStep(NamedTuple):
+    """What the forward model says that the chosen actions will do.
+
+    :param observations: ``[n_envs, *obs_shape]``.
+    :param rewards: ``[n_envs]``, of the environment.
+    """
+
+    observations: Observations
+    rewards: np.ndarray
+
+
+class SearchResult(NamedTuple):
+    """The outcome of one decision in every environment.
+
+    :param actions: ``[n_envs, act_dim]``, the actions to execute, scaled.
+    :param chosen: ``[n_envs]``, which candidate that is; -1 where every candidate was invalid and the
+        policy's own action was taken.
+    :param candidates: ``[n_envs, beam, act_dim]``, all that were simulated: of a tree the root actions, of a
+        refinement the first actions of all its rounds.
+    :param values: ``[n_envs, beam]``, Q~_i; -inf where a simulation of the candidate was invalid. In a tree
+        a root action that was dropped keeps the value with which it was dropped.
+    :param first_step: the chosen candidates' first simulated step (of their first simulation);
+        ``None`` if nothing was simulated. Meaningless where ``chosen`` is -1.
+    :param simulated_steps: environment steps that were simulated, each counted once.
+    :param invalid_rollouts: rollouts that diverged or whose value is not finite.
+    :param rounds: finished rounds: 1, or any number if the search had a time budget, or ``n_rounds``.
+    :param critic_evaluations: observations with an action that the critics rated.
+    :param surviving_roots: of a tree: ``[n_envs]``, how many root actions still had a node at the end.
+    """
+
+    actions: np.ndarray
+    chosen: np.ndarray
+    candidates: np.ndarray
+    values: np.ndarray
+    first_step: FirstStep | None
+    simulated_steps: int
+    invalid_rollouts: int
+    rounds: int = 1
+    critic_evaluations: int = 0
+    surviving_roots: np.ndarray | None = None
+
+
+def take_rows(observations: Observations, index: np.ndarray | slice) -> Observations:
+    """Copy rows out of observations.
+
+    :param observations: ``[rows, *obs_shape]``.
+    :param index: which rows.
+    :return: the copy.
+    """
+    if isinstance(observations, dict):
+        return {key: value[index].copy() for key, value in observations.items()}
+    return observations[index].copy()

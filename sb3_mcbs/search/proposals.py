@@ -1,0 +1,147 @@
+"""Where candidates come from: noise around the policy's actions, and the critics' first look at them.
+
+All random numbers of a decision are drawn before anything is simulated, as float32 and in a fixed order,
+so that they do not depend on what the simulations give.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from sb3_mcbs.models.base import Observations
+from sb3_mcbs.search.interface import Agent, take_rows
+from sb3_mcbs.search.settings import SearchSettings
+
+
+class Noise(NamedTuple):
+    """All random numbers of one decision by Algorithm 1.
+
+    :param beam: ``[n_envs, proposals, act_dim]``, eta_i in Algorithm 1.
+    :param rollout: ``[rollout_depth, n_envs, beam, sim, act_dim]``, eta in ShortHorizon.
+    """
+
+    beam: np.ndarray
+    rollout: np.ndarray
+
+
+def draw_noise(
+    rng: np.random.Generator,
+    settings: SearchSettings,
+    n_envs: int,
+    act_dim: int,
+    beam_width: int | None = None,
+) -> Noise:
+    """Draw the noise of one decision: first that of the candidates, then that of the rollouts.
+
+    :param rng: generator of the search.
+    :param settings: width, depth, simulations, noise scales, and how draws depend on one another.
+    :param n_envs: number of environments.
+    :param act_dim: entries of one action.
+    :param beam_width: candidates; ``None``: as many as the settings say.
+    :return: the noise, clipped to ``noise_clip`` if that is set.
+    """
+    b, d, n = beam_width or settings.beam_width, settings.rollout_depth, settings.n_simulations
+    n_proposals = settings.n_proposals or b
+    pairs = settings.antithetic
+    beam = draw_normal(rng, (n_envs, n_proposals, act_dim), 1 if pairs else None)
+    shape = (d, n_envs, 1 if settings.common_noise else b, n, act_dim)
+    rollout = scale(draw_normal(rng, shape, 3 if pairs else None), settings.effective_rollout_noise, settings)
+    return Noise(
+        scale(beam, settings.beam_noise, settings), np.broadcast_to(rollout, (d, n_envs, b, n, act_dim))
+    )
+
+
+def draw_normal(rng: np.random.Generator, shape: tuple[int, ...], pairs: int | None) -> np.ndarray:
+    """Draw Gaussian noise, or antithetic pairs of it.
+
+    With pairs the second half along their axis is minus the first half, and with an odd number the first
+    one is 0, so that the sum is 0 always. A single one stays as it was drawn.
+
+    :param rng: generator of the search.
+    :param shape: of the noise.
+    :param pairs: along which axis there are pairs; ``None``: all draws are independent.
+    :return: float32 of that shape, of standard deviation 1.
+    """
+    if pairs is None or shape[pairs] < 2:
+        return rng.standard_normal(shape, dtype=np.float32)
+
+    def of_count(count: int) -> tuple[int, ...]:
+        return (*shape[:pairs], count, *shape[pairs + 1 :])
+
+    half = rng.standard_normal(of_count(shape[pairs] // 2), dtype=np.float32)
+    unpaired = np.zeros(of_count(shape[pairs] % 2), dtype=np.float32)
+    return np.concatenate([unpaired, half, -half], axis=pairs)
+
+
+def scale(noise: np.ndarray, spread: float | np.ndarray, settings: SearchSettings) -> np.ndarray:
+    """Give noise its standard deviation, and clip it to ``noise_clip`` if that is set.
+
+    :param noise: of standard deviation 1.
+    :param spread: standard deviations, one for all or an array that fits.
+    :param settings: of the search.
+    :return: the noise in the action space scaled to [-1, 1].
+    """
+    noise = noise * np.asarray(spread, dtype=np.float32)
+    if settings.noise_clip is not None:
+        np.clip(noise, -settings.noise_clip, settings.noise_clip, out=noise)
+    return noise
+
+
+def propose(policy_actions: np.ndarray, noise: np.ndarray, include_policy_action: bool) -> np.ndarray:
+    """Generate candidate actions (Algorithm 1, step 1).
+
+    :param policy_actions: ``[n_envs, act_dim]``.
+    :param noise: ``[n_envs, beam, act_dim]``.
+    :param include_policy_action: whether the first candidate has no noise.
+    :return: ``[n_envs, beam, act_dim]`` in [-1, 1].
+    """
+    candidates = clip_actions(policy_actions[:, None] + noise)
+    if include_policy_action:
+        candidates[:, 0] = policy_actions
+    return candidates
+
+
+def preselect(values: np.ndarray, keep: int, always: int) -> np.ndarray:
+    """Find the actions that the critics value most.
+
+    :param values: ``[n, proposals]``, from :func:`critic_values`.
+    :param keep: how many are kept.
+    :param always: how many of the first are kept whatever the critics say.
+    :return: ``[n, keep]``, places among the proposals, rising.
+    """
+    values = np.where(np.isfinite(values), values, -np.inf)
+    values[:, :always] = np.inf
+    return best(values, keep)
+
+
+def best(values: np.ndarray, keep: int) -> np.ndarray:
+    """Find the highest values, of equal ones the first.
+
+    :param values: ``[n, candidates]``.
+    :param keep: how many.
+    :return: ``[n, keep]``, their places, rising.
+    """
+    return np.sort(np.argsort(-values, axis=1, kind="stable")[:, :keep], axis=1)
+
+
+def critic_values(observations: Observations, candidates: np.ndarray, agent: Agent) -> np.ndarray:
+    """Rank candidates by the critics alone: the paper's first evaluation step.
+
+    :param observations: ``[n, *obs_shape]``.
+    :param candidates: ``[n, beam, act_dim]``.
+    :param agent: the critics.
+    :return: ``[n, beam]`` in float64.
+    """
+    n, beam, act_dim = candidates.shape
+    repeated = take_rows(observations, np.repeat(np.arange(n), beam))
+    values = agent.value(repeated, candidates.reshape(-1, act_dim))
+    return values.reshape(n, beam).astype(np.float64)
+
+
+def clip_actions(actions: np.ndarray) -> np.ndarray:
+    """Clip to [-1, 1] in place; two ufuncs are quicker than ``np.clip``.
+
+    :param actions: any shape.
+    :return: the same array.
+    """
+    return np.maximum(np.minimum(actions, 1, out=actions), -1, out=actions)

@@ -1,0 +1,155 @@
+"""Refinement: cross-entropy rounds around the best candidates so far.
+
+A candidate is a *plan*: what is added to the policy's action at each of the next ``rollout_depth`` steps,
+``a_t = clip(pi(s_t) + plan_t, -1, 1)``. Plans are rolled out as Algorithm 1 rolls out its candidates, only
+that the noise of later steps belongs to the plan.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sb3_mcbs.models.base import ForwardModel, Observations
+from sb3_mcbs.search.beam import choose, join_rounds, mean_values, rollout_values
+from sb3_mcbs.search.interface import Agent, FirstStep, SearchResult
+from sb3_mcbs.search.proposals import Noise, best, critic_values, draw_normal, preselect, propose, scale
+from sb3_mcbs.search.settings import SearchSettings
+
+
+class Plans(NamedTuple):
+    """What plans are drawn from: independent Gaussians.
+
+    :param mean: ``[n_envs, rollout_depth, act_dim]``.
+    :param spread: ``[n_envs, rollout_depth, act_dim]``, standard deviations.
+    """
+
+    mean: np.ndarray
+    spread: np.ndarray
+
+
+def draw_plan_noise(
+    rng: np.random.Generator, settings: SearchSettings, n_envs: int, act_dim: int
+) -> np.ndarray:
+    """Draw the noise of one decision, of all rounds at once.
+
+    :param rng: generator of the search.
+    :param settings: rounds, width and depth.
+    :param n_envs: number of environments.
+    :param act_dim: entries of one action.
+    :return: ``[n_rounds, n_envs, proposals, rollout_depth, act_dim]``, of standard deviation 1.
+    """
+    n_proposals = settings.n_proposals or settings.beam_width
+    shape = (settings.n_rounds, n_envs, n_proposals, settings.rollout_depth, act_dim)
+    return draw_normal(rng, shape, 2 if settings.antithetic else None)
+
+
+def refine_search(
+    model: ForwardModel,
+    roots: Sequence[Any],
+    observations: Observations,
+    agent: Agent,
+    settings: SearchSettings,
+    noise: np.ndarray,
+    rng: np.random.Generator,
+    remembered: np.ndarray,
+) -> tuple[SearchResult, np.ndarray]:
+    """Choose one action per environment: the first action of the best plan of all rounds.
+
+    :param model: simulates the plans.
+    :param roots: present states of the environments.
+    :param observations: ``[n_envs, *obs_shape]``, present observations.
+    :param agent: networks, discount and scales.
+    :param settings: rounds, width, depth, elites and spreads.
+    :param noise: from :func:`draw_plan_noise`.
+    :param rng: given to a model with random dynamics.
+    :param remembered: ``[n_envs, rollout_depth, act_dim]``, the plans to start around; 0 is the policy.
+    :return: the actions and what the search found, and the plans that the actions are from,
+        ``[n_envs, rollout_depth, act_dim]``; 0 where none was valid.
+    """
+    policy_actions = agent.policy(observations)
+    source = Plans(remembered, np.broadcast_to(first_spread(settings), remembered.shape))
+    plans: list[np.ndarray] = []
+    candidates: list[np.ndarray] = []
+    values: list[np.ndarray] = []
+    first_steps: list[FirstStep] = []
+    simulated_steps = 0
+    for number, round_noise in enumerate(noise):
+        if number:
+            source = refit(source, np.concatenate(plans, axis=1), np.concatenate(values, axis=1), settings)
+        drawn = source.mean[:, None] + scale(round_noise, source.spread[:, None], settings)
+        always = _put_first(drawn, source.mean, settings.include_policy_action and number == 0)
+        proposed = propose(policy_actions, drawn[:, :, 0], include_policy_action=False)
+        if settings.n_proposals is not None:
+            kept = preselect(critic_values(observations, proposed, agent), settings.beam_width, always)
+            proposed = np.take_along_axis(proposed, kept[..., None], axis=1)
+            drawn = np.take_along_axis(drawn, kept[..., None, None], axis=1)
+        found, first_step, steps = rollout_values(
+            model, roots, proposed, agent, settings, _as_noise(drawn, settings.n_simulations), rng
+        )
+        plans.append(drawn)
+        candidates.append(proposed)
+        values.append(found)
+        first_steps.append(first_step)
+        simulated_steps += steps
+    result = choose(
+        policy_actions,
+        np.concatenate(candidates, axis=1),
+        np.concatenate(values, axis=1),
+        join_rounds(first_steps, len(policy_actions)),
+        simulated_steps,
+    )
+    chosen_plans = np.concatenate(plans, axis=1)[np.arange(len(policy_actions)), result.chosen]
+    chosen_plans[result.chosen < 0] = 0
+    return result._replace(rounds=settings.n_rounds), chosen_plans
+
+
+def first_spread(settings: SearchSettings) -> np.ndarray:
+    """Standard deviations of the first round: ``beam_noise`` now, ``rollout_noise`` later.
+
+    :return: ``[rollout_depth, 1]``.
+    """
+    spread = np.full((settings.rollout_depth, 1), settings.effective_rollout_noise, dtype=np.float32)
+    spread[0] = settings.beam_noise
+    return spread
+
+
+def refit(source: Plans, plans: np.ndarray, values: np.ndarray, settings: SearchSettings) -> Plans:
+    """Fit the Gaussians to the best plans so far.
+
+    :param source: what the last round was drawn from; stays where no plan was valid.
+    :param plans: ``[n_envs, candidates, rollout_depth, act_dim]``, of all rounds until now.
+    :param values: ``[n_envs, candidates, sim]``, theirs.
+    :param settings: the number of elites, and the floor of the spread.
+    :return: mean and standard deviation of the elites.
+    """
+    means, _ = mean_values(values)
+    elites = best(means, settings.effective_n_elites)
+    valid = np.isfinite(np.take_along_axis(means, elites, axis=1))
+    count = valid.sum(axis=1)
+    weights = (valid / np.maximum(count, 1)[:, None]).astype(np.float32)[..., None, None]
+    chosen = np.take_along_axis(plans, elites[..., None, None], axis=1)
+    mean = (weights * chosen).sum(axis=1)
+    spread = np.sqrt((weights * np.square(chosen - mean[:, None])).sum(axis=1))
+    floor = np.minimum(first_spread(settings), np.float32(settings.min_noise))
+    none = (count == 0)[:, None, None]
+    return Plans(np.where(none, source.mean, mean), np.where(none, source.spread, np.maximum(spread, floor)))
+
+
+def _put_first(drawn: np.ndarray, mean: np.ndarray, with_policy: bool) -> int:
+    """Make the mean the first plan and, where that is another one, the policy alone the second.
+
+    :return: how many plans were given a place.
+    """
+    drawn[:, 0] = mean
+    if with_policy:
+        drawn[mean.any(axis=(1, 2)), 1] = 0
+    return 1 + with_policy
+
+
+def _as_noise(plans: np.ndarray, n_simulations: int) -> Noise:
+    """Plans as the noise of rollouts; the action that closes a rollout is the policy's own."""
+    later = np.concatenate([plans[:, :, 1:], np.zeros_like(plans[:, :, :1])], axis=2)
+    by_depth = np.moveaxis(later, 2, 0)[:, :, :, None]
+    shape = (*by_depth.shape[:3], n_simulations, by_depth.shape[4])
+    return Noise(plans[:, :, 0], np.broadcast_to(by_depth, shape))

@@ -1,0 +1,105 @@
+"""The strategies by their names, behind one way to call them."""
+
+import logging
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sb3_mcbs.models.base import ForwardModel, Observations
+from sb3_mcbs.search.beam import beam_search
+from sb3_mcbs.search.interface import Agent, SearchResult
+from sb3_mcbs.search.memory import Moment, PlanMemory
+from sb3_mcbs.search.proposals import draw_noise
+from sb3_mcbs.search.refine import draw_plan_noise, refine_search
+from sb3_mcbs.search.settings import SearchSettings
+from sb3_mcbs.search.tree import draw_tree_noise, tree_search
+
+logger = logging.getLogger("sb3_mcbs")
+
+
+class Decision(NamedTuple):
+    """One decision in every environment.
+
+    :param model: simulates; may be ``None`` if ``rollout_depth`` is 0.
+    :param roots: present states of the environments, from :meth:`ForwardModel.read_roots`.
+    :param observations: ``[n_envs, *obs_shape]``, present observations.
+    :param agent: networks, discount and scales.
+    :param settings: settings of the search.
+    :param shape: ``(n_envs, act_dim)``.
+    :param rng: of the search: draws all noise, and is given to a model with random dynamics.
+    :param memory: of the strategy ``"refine"``.
+    :param moments: the present moment of every environment, for the memory.
+    """
+
+    model: ForwardModel | None
+    roots: Sequence[Any]
+    observations: Observations
+    agent: Agent
+    settings: SearchSettings
+    shape: tuple[int, int]
+    rng: np.random.Generator
+    memory: PlanMemory | None = None
+    moments: Sequence[Moment] = ()
+
+
+def search(decision: Decision) -> SearchResult:
+    """Choose one action per environment by the strategy that the settings name.
+
+    :param decision: what there is to decide.
+    :return: actions, and what the search found.
+    """
+    evaluations = 0
+
+    def value(observations: Observations, actions: np.ndarray) -> np.ndarray:
+        nonlocal evaluations
+        evaluations += len(actions)
+        return decision.agent.value(observations, actions)
+
+    strategy = STRATEGIES[decision.settings.strategy]
+    result = strategy(decision._replace(agent=decision.agent._replace(value=value)))
+    return result._replace(critic_evaluations=evaluations)
+
+
+def check_dynamics(settings: SearchSettings, deterministic: bool) -> None:
+    """Say which settings make no sense with an environment's dynamics.
+
+    :param settings: of the search.
+    :param deterministic: whether the environment's steps are.
+    :raises ValueError: if the search would follow the luckiest random draw.
+    """
+    if not deterministic and settings.strategy != "beam" and settings.n_simulations == 1:
+        raise ValueError(
+            f"strategy={settings.strategy!r} needs n_simulations of 2 or more here: the environment's steps "
+            "are random, and with one simulation the luckiest draw would win."
+        )
+    if settings.distinct_simulations(deterministic) < settings.n_simulations:
+        logger.warning(
+            "n_simulations=%d is reduced to 1: the environment's steps are deterministic and nothing else "
+            "is random in a simulation, so all would be the same.",
+            settings.n_simulations,
+        )
+
+
+def _beam(decision: Decision) -> SearchResult:
+    noise = draw_noise(decision.rng, decision.settings, *decision.shape)
+    return beam_search(*decision[:5], noise, decision.rng)
+
+
+def _tree(decision: Decision) -> SearchResult:
+    assert decision.model is not None, "a tree needs a forward model"
+    noise = draw_tree_noise(decision.rng, decision.settings, *decision.shape)
+    return tree_search(decision.model, *decision[1:5], noise, decision.rng)
+
+
+def _refine(decision: Decision) -> SearchResult:
+    assert decision.model is not None, "a refinement needs a forward model"
+    assert decision.memory is not None, "a refinement remembers its plans"
+    noise = draw_plan_noise(decision.rng, decision.settings, *decision.shape)
+    remembered = decision.memory.recall(decision.moments)
+    result, plans = refine_search(decision.model, *decision[1:5], noise, decision.rng, remembered)
+    decision.memory.keep(plans, decision.moments)
+    return result
+
+
+STRATEGIES: dict[str, Callable[[Decision], SearchResult]] = {"beam": _beam, "tree": _tree, "refine": _refine}

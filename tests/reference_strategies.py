@@ -1,0 +1,210 @@
+"""Tree and refinement with loops, one simulation at a time: the oracles for the batched strategies.
+
+Both use a :class:`~tests.reference_search.Reference` as the simulator of one environment: its ``restore``,
+``env_step``, ``policy``, ``critics`` and ``gamma``. Every simulation starts at the root again and repeats its
+actions. A step whose reward is NaN has diverged. Random numbers are handed in.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from tests.reference_search import Reference, clip
+
+
+@dataclass
+class Outcome:
+    """What a reference found.
+
+    :ivar action: the action to execute, None if nothing was valid.
+    :ivar values: by candidate, the value with which it was left.
+    :ivar steps: simulated steps.
+    """
+
+    action: np.ndarray | None = None
+    candidates: list[np.ndarray] = field(default_factory=list)
+    values: list[float] = field(default_factory=list)
+    steps: int = 0
+    surviving_roots: int = 0
+    plan: np.ndarray | None = None
+
+
+@dataclass
+class Node:
+    actions: list[np.ndarray]
+    root: int
+    rewards: float
+    observation: np.ndarray
+    done: bool
+    score: float
+
+
+def shortlist(reference: Reference, observation, actions: list, keep: int, always: int) -> list[int]:
+    """Places of the actions that the critics value most, and of the first ``always`` ones."""
+    by_value = sorted(
+        range(len(actions)),
+        key=lambda i: -math.inf if i < always else -min(reference.critics(observation, actions[i])),
+    )
+    return sorted(by_value[:keep])
+
+
+class ReferenceTree:
+    """Partial tree expansion in one environment.
+
+    :param reference: the simulator and the agent
+    :param width: nodes that are kept at every depth
+    :param branching: children of each
+    :param include_policy_action: whether the first child's action is the policy's own
+    :param one_node_per_root: whether only the best node of each root action is kept
+    """
+
+    def __init__(
+        self,
+        reference: Reference,
+        width: int,
+        branching: int,
+        include_policy_action: bool = False,
+        one_node_per_root: bool = False,
+    ) -> None:
+        self.reference, self.width, self.branching = reference, width, branching
+        self.include_policy_action, self.one_node_per_root = include_policy_action, one_node_per_root
+        self.outcome = Outcome()
+
+    def choose(self, observation, root_noise: np.ndarray, later_noise: np.ndarray) -> Outcome:
+        """
+        :param observation: the present one
+        :param root_noise: ``[proposals, act_dim]``
+        :param later_noise: ``[depth - 1, width, proposals / width, act_dim]``
+        """
+        n_roots = self.width * self.branching
+        ranking = []
+        for root, action in enumerate(self.children(observation, root_noise, n_roots)):
+            self.outcome.candidates.append(action)
+            self.outcome.values.append(-math.inf)
+            ranking += self.simulate([action], root)
+        kept = self.keep(ranking)
+        for noise in later_noise:
+            ranking = []
+            for slot, node in enumerate(kept):
+                if not node.done:
+                    for action in self.children(node.observation, noise[slot], self.branching):
+                        ranking += self.simulate([*node.actions, action], node.root)
+            ranking += [node for node in kept if node.done]
+            kept = self.keep(ranking)
+        if kept:
+            leaf = max(kept, key=lambda node: (node.score, -node.root))
+            self.outcome.action = leaf.actions[0]
+        self.outcome.surviving_roots = len({node.root for node in kept})
+        return self.outcome
+
+    def children(self, observation, noise: np.ndarray, number: int) -> list[np.ndarray]:
+        mean = self.reference.policy(observation)
+        actions = [clip(mean + one) for one in noise]
+        if self.include_policy_action:
+            actions[0] = mean
+        always = int(self.include_policy_action)
+        return [actions[i] for i in shortlist(self.reference, observation, actions, number, always)]
+
+    def simulate(self, actions: list[np.ndarray], root: int) -> list[Node]:
+        """The node at the end of some actions, in a list that is empty if the last step diverged."""
+        reference, gamma = self.reference, self.reference.gamma
+        reference.restore()
+        total = 0.0
+        for depth, action in enumerate(actions):
+            observation, reward, done = reference.env_step(action)
+            total += gamma**depth * float(reward)
+        self.outcome.steps += 1  # the others are repetitions
+        if math.isnan(total):
+            return []
+        score = total
+        if not done:
+            score += gamma ** len(actions) * min(
+                reference.critics(observation, reference.policy(observation))
+            )
+        return [Node(actions, root, total, observation, done, score)]
+
+    def keep(self, ranking: list[Node]) -> list[Node]:
+        for root in {node.root for node in ranking}:
+            self.outcome.values[root] = max(node.score for node in ranking if node.root == root)
+        places = sorted(range(len(ranking)), key=lambda i: -ranking[i].score)
+        if self.one_node_per_root:
+            places = [
+                place
+                for rank, place in enumerate(places)
+                if ranking[place].root not in [ranking[better].root for better in places[:rank]]
+            ]
+        return [ranking[place] for place in sorted(places[: self.width])]
+
+
+class ReferenceRefine:
+    """Cross-entropy refinement of plans in one environment.
+
+    :param reference: the simulator and the agent
+    :param width: plans per round
+    :param n_elites: best plans that the next round is drawn around
+    :param spreads: ``[depth]``, standard deviations of the first round
+    :param min_noise: their floor in later rounds
+    :param include_policy_action: whether the policy alone is a plan of the first round
+    """
+
+    def __init__(
+        self,
+        reference: Reference,
+        width: int,
+        n_elites: int,
+        spreads: list[float],
+        min_noise: float,
+        include_policy_action: bool = False,
+    ) -> None:
+        self.reference, self.width, self.n_elites = reference, width, n_elites
+        self.spreads, self.min_noise = spreads, min_noise
+        self.include_policy_action = include_policy_action
+
+    def choose(self, observation, noise: np.ndarray, remembered: np.ndarray) -> Outcome:
+        """
+        :param observation: the present one
+        :param noise: ``[rounds, proposals, depth, act_dim]``
+        :param remembered: ``[depth, act_dim]``, the plan to start around
+        """
+        outcome = Outcome()
+        mean = np.asarray(remembered, dtype=np.float32)
+        spread = np.repeat(np.float32(self.spreads)[:, None], mean.shape[1], axis=1)
+        plans: list[np.ndarray] = []
+        for number, of_round in enumerate(noise):
+            drawn = [mean + one * spread for one in of_round]
+            drawn[0] = mean
+            if number == 0 and self.include_policy_action and mean.any():
+                drawn[1] = np.zeros_like(mean)
+            first = [clip(self.reference.policy(observation) + plan[0]) for plan in drawn]
+            always = 1 + (number == 0 and self.include_policy_action)
+            for i in shortlist(self.reference, observation, first, self.width, always):
+                plans.append(drawn[i])
+                outcome.candidates.append(first[i])
+                outcome.values.append(self.value(observation, drawn[i], outcome))
+            ranked = sorted(range(len(plans)), key=lambda i: -outcome.values[i])[: self.n_elites]
+            elites = [plans[i] for i in ranked if outcome.values[i] > -math.inf]
+            if elites:
+                mean = np.mean(elites, axis=0)
+                floor = np.float32([[min(self.min_noise, of_first)] for of_first in self.spreads])
+                spread = np.maximum(np.std(elites, axis=0), floor)
+        if max(outcome.values) > -math.inf:
+            chosen = outcome.values.index(max(outcome.values))
+            outcome.action, outcome.plan = outcome.candidates[chosen], plans[chosen]
+        return outcome
+
+    def value(self, observation, plan: np.ndarray, outcome: Outcome) -> float:
+        reference = self.reference
+        reference.restore()
+        total, discount = 0.0, 1.0
+        for residual in plan:
+            action = clip(reference.policy(observation) + residual)
+            observation, reward, done = reference.env_step(action)
+            outcome.steps += 1
+            total += discount * float(reward)
+            discount *= reference.gamma
+            if math.isnan(total):
+                return -math.inf
+            if done:
+                return total
+        return total + discount * min(reference.critics(observation, reference.policy(observation)))

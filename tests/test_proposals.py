@@ -1,0 +1,180 @@
+"""Options that combine with strategies: the noise that is drawn, what is simulated, what is refused."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from sb3_mcbs import SearchSettings
+from sb3_mcbs.search import PRESETS, check_dynamics, draw_noise
+from sb3_mcbs.search.proposals import best, draw_normal, preselect
+from sb3_mcbs.search.refine import draw_plan_noise
+from sb3_mcbs.search.tree import draw_tree_noise
+from tests.fake_model import LineWorld
+from tests.test_search import critics, search
+
+
+def rng():
+    return np.random.default_rng(0)
+
+
+def test_proposing_as_many_as_are_simulated_changes_nothing():
+    plain = SearchSettings(6, 3, 2, beam_noise=0.4)
+    chosen = SearchSettings(6, 3, 2, beam_noise=0.4, n_proposals=6)
+    roots = [0.3, -1.2]
+    noise = draw_noise(rng(), plain, 2, 1)
+    same = draw_noise(rng(), chosen, 2, 1)
+    np.testing.assert_array_equal(noise.beam, same.beam)
+    np.testing.assert_array_equal(noise.rollout, same.rollout)
+    expected = search(LineWorld(1.3), roots, plain, noise)
+    result = search(LineWorld(1.3), roots, chosen, same)
+    np.testing.assert_array_equal(result.values, expected.values)
+    np.testing.assert_array_equal(result.actions, expected.actions)
+
+
+@pytest.mark.parametrize("include", [False, True])
+def test_the_critics_choose_what_is_simulated(include):
+    settings = SearchSettings(
+        3, 2, 1, beam_noise=0.4, n_proposals=50, include_policy_action=include, rollout_noise=0.0
+    )
+    noise, model = draw_noise(rng(), settings, 1, 1), LineWorld()
+    assert noise.beam.shape == (1, 50, 1) and noise.rollout.shape == (2, 1, 3, 1, 1)
+    result = search(model, [1.5], settings, noise)
+    all_proposals = search(
+        LineWorld(),
+        [1.5],
+        SearchSettings(50, 1, 1, include_policy_action=include),
+        noise._replace(rollout=np.zeros((1, 1, 50, 1, 1), dtype=np.float32)),
+    ).candidates[0]
+    by_critics = sorted(all_proposals[include:], key=lambda action: -min(critics(np.array([1.5]), action)))
+    expected = {float(action[0]) for action in by_critics[: 3 - include]}
+    if include:
+        expected.add(float(all_proposals[0, 0]))
+    assert set(result.candidates[0, :, 0].tolist()) == expected
+    assert model.steps_taken == 6
+
+
+def test_critics_that_are_not_finite_choose_nothing():
+    values = np.array([[np.nan, 1.0, np.inf, 3.0, -np.inf, 2.0]])
+    np.testing.assert_array_equal(preselect(values, 3, always=0), [[1, 3, 5]])
+    np.testing.assert_array_equal(preselect(values, 3, always=1), [[0, 3, 5]])
+    np.testing.assert_array_equal(best(np.array([[1.0, 2.0, 2.0, 2.0]]), 2), [[1, 2]])
+
+
+@pytest.mark.parametrize("count", [1, 2, 5, 6])
+def test_antithetic_pairs_cancel(count):
+    settings = SearchSettings(
+        count, 3, count, strategy="tree", branching=count, antithetic=True, noise_clip=0.15
+    )
+    noise = draw_noise(rng(), settings, 2, 3)
+    tree = draw_tree_noise(rng(), settings, 2, 3)
+    plans = draw_plan_noise(rng(), settings, 2, 3)
+    for drawn, axis in ((noise.beam, 1), (noise.rollout, 3), (tree.later, 3), (plans, 2)):
+        assert drawn.shape[axis] == count
+        if count > 1:
+            np.testing.assert_array_equal(drawn.sum(axis=axis, dtype=np.float64), 0)
+            assert (np.take(drawn, [0], axis=axis) == 0).all() == (count % 2 == 1)
+        assert drawn.any()
+    assert np.abs(noise.rollout).max() <= np.float32(0.15)
+    assert tree.roots.shape == (2, 1, count * count, 3)
+
+
+def test_pairs_are_of_independent_draws():
+    drawn = draw_normal(rng(), (4, 1000, 2), 1)
+    assert drawn.dtype == np.float32
+    assert len(np.unique(np.abs(drawn))) == drawn.size // 2
+    assert drawn.std() == pytest.approx(1.0, rel=0.05)
+
+
+def test_common_noise_is_shared_by_all_candidates():
+    settings = SearchSettings(4, 3, 2, common_noise=True)
+    noise = draw_noise(rng(), settings, 2, 3)
+    assert noise.rollout.shape == (3, 2, 4, 2, 3)
+    assert (noise.rollout == noise.rollout[:, :, :1]).all()
+    assert len(np.unique(noise.rollout)) == 3 * 2 * 2 * 3, "but differs otherwise"
+    assert len(np.unique(noise.beam)) == noise.beam.size
+    settings = SearchSettings(4, 3, 1, common_noise=True, strategy="tree", branching=2)
+    tree = draw_tree_noise(rng(), settings, 2, 3)
+    assert (tree.later == tree.later[:, :, :1]).all()
+    assert len(np.unique(tree.later)) == 2 * 2 * 2 * 3
+
+
+def test_common_noise_makes_equal_candidates_equal():
+    """Two candidates that are the same get the same value, which independent noise does not give them."""
+    for common in (False, True):
+        settings = SearchSettings(2, 3, 2, common_noise=common, rollout_noise=0.3, beam_noise=0.0)
+        values = search(LineWorld(), [0.5], settings, draw_noise(rng(), settings, 1, 1)).values[0]
+        assert (values[0] == values[1]) == common
+
+
+@pytest.mark.parametrize(
+    "changes, words",
+    [
+        (dict(strategy="best"), "strategy must be one of"),
+        (dict(strategy=["tree"]), "strategy must be one of"),
+        (dict(strategy="tree", rollout_depth=0), "rollout_depth of 1"),
+        (dict(strategy="refine", rollout_depth=0), "rollout_depth of 1"),
+        (dict(strategy="tree", beam_noise=0.0), "beam_noise above 0"),
+        (dict(strategy="refine", noise_clip=0.0), "noise_clip above 0"),
+        (dict(strategy="refine", beam_width=1), "beam_width of 2"),
+        (dict(strategy="tree", rollout_noise=0.0), "rollout_noise above 0"),
+        (dict(strategy="tree", branching=0), "branching"),
+        (dict(strategy="tree", time_budget=1.0), "strategy='beam' only"),
+        (dict(strategy="refine", time_budget=1.0), "strategy='beam' only"),
+        (dict(n_proposals=6, time_budget=1.0), "n_proposals"),
+        (dict(antithetic=True, time_budget=1.0), "antithetic"),
+        (dict(common_noise=True, time_budget=1.0), "common_noise"),
+        (dict(n_proposals=5), "n_proposals must be between 6"),
+        (dict(n_proposals=29, strategy="tree"), "n_proposals must be between 30"),
+        (dict(n_proposals=31, strategy="tree"), "multiple of beam_width=6"),
+        (dict(n_proposals=10, rollout_depth=0), "n_proposals needs a rollout_depth"),
+        (dict(common_noise=True, rollout_noise=0.0), "leave it out"),
+        (dict(common_noise=True, rollout_depth=0), "leave it out"),
+        (dict(common_noise=True, rollout_depth=1, strategy="tree"), "leave it out"),
+        (dict(common_noise=True, strategy="refine"), "no meaning"),
+        (dict(n_rounds=0), "n_rounds"),
+        (dict(n_elites=7), "n_elites must be between 1 and 6"),
+        (dict(min_noise=-0.1), "min_noise"),
+    ],
+)
+def test_senseless_combinations_are_refused(changes, words):
+    with pytest.raises(ValueError, match=words):
+        SearchSettings(**changes)
+
+
+@pytest.mark.parametrize("name", ["common_noise", "antithetic", "one_node_per_root"])
+def test_switches_are_booleans(name):
+    with pytest.raises(TypeError, match=f"{name} must be True or False"):
+        SearchSettings(**{name: 1})
+
+
+def test_simulations_that_would_be_the_same_are_reduced_with_a_message(caplog):
+    for settings in (SearchSettings(rollout_noise=0.0), SearchSettings(strategy="refine")):
+        caplog.clear()
+        check_dynamics(settings, deterministic=True)
+        assert "n_simulations=5 is reduced to 1" in caplog.text
+        caplog.clear()
+        check_dynamics(settings, deterministic=False)
+        assert not caplog.text
+    check_dynamics(SearchSettings(), deterministic=True)
+    assert not caplog.text
+
+
+def test_presets():
+    assert SearchSettings.preset("paper") == SearchSettings()
+    for name, steps in (("efficient", 20), ("balanced", 110), ("strong", 580)):
+        assert 0.8 * steps < SearchSettings.preset(name).simulated_steps() <= steps
+        assert set(PRESETS[name]) <= set(SearchSettings.names())
+    assert SearchSettings.preset("balanced", rollout_depth=2, n_threads=1).rollout_depth == 2
+    for unknown in ("best", None, ["strong"]):
+        with pytest.raises(ValueError, match="known are paper, efficient, balanced, strong"):
+            SearchSettings.preset(unknown)
+
+
+def test_agents_of_before_a_setting_existed_have_its_default():
+    old = SimpleNamespace(beam_width=3, rollout_depth=2)
+    assert SearchSettings.of(old) == SearchSettings(3, 2)
+
+
+def test_settings_of_other_strategies_are_not_in_the_way():
+    assert SearchSettings(strategy="beam", branching=7, n_rounds=9).strategy == "beam"
