@@ -6,18 +6,18 @@ import os
 import signal
 import sys
 import warnings
-from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_mcbs.checkpoints.buffers import added_rows, check_buffer, read_rows, rows_held
+from sb3_mcbs.checkpoints.encoding import in_section
 from sb3_mcbs.checkpoints.errors import CheckpointError
 from sb3_mcbs.checkpoints.files import describe_format
 from sb3_mcbs.checkpoints.interrupts import Interrupts, TrainingInterrupted
-from sb3_mcbs.checkpoints.resumption import Resumption, pending
+from sb3_mcbs.checkpoints.resumption import SETTINGS, Resumption, pending
 from sb3_mcbs.checkpoints.settings import circumstances, describe_agent, describe_vec_env, inexact
 from sb3_mcbs.checkpoints.state import RunState
 from sb3_mcbs.checkpoints.store import Store
@@ -178,7 +178,7 @@ class ExactCheckpointCallback(BaseCallback):
             rows = read_rows(buffer, first, self._rows_added)
             parts.append(self.store.write_rows(first, self._rows_added, rows))
         manifest = {**self._describe(agent), "rows": parts}
-        arrays = {**captured.arrays, **{f"settings|{k}": v for k, v in self._settings.arrays.items()}}
+        arrays = {**captured.arrays, **in_section(SETTINGS, self._settings.arrays)}
         self.store.write(self.num_timesteps, manifest, captured.json, arrays)
         self._parts = parts
         self.store.clean(self.keep_last)
@@ -215,24 +215,3 @@ class ExactCheckpointCallback(BaseCallback):
                 return True
             frame = frame.f_back
         return False
-
-
-def find_in(callback: BaseCallback) -> ExactCheckpointCallback | None:
-    """Return the ``ExactCheckpointCallback`` of a run.
-
-    :param callback: the callback of its ``learn``.
-    """
-    if isinstance(callback, ExactCheckpointCallback):
-        return callback
-    if isinstance(callback, CallbackList):
-        return next((found for found in map(find_in, callback.callbacks) if found is not None), None)
-    return None
-
-
-def folder_of(path: str | os.PathLike[str]) -> Path:
-    """Return the folder of checkpoints that a path means: itself, or the one around a single checkpoint.
-
-    :param path: what the user gave.
-    """
-    path = Path(path)
-    return path.parent if path.name.startswith("step_") else path

@@ -5,8 +5,8 @@ from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import KVWriter, Logger
+from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
+from stable_baselines3.common.logger import KVWriter
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvWrapper
@@ -72,12 +72,9 @@ NOT_STATE: dict[type, dict[str, str]] = {
         "model": "the agent, or its SearchPolicy, is a component of its own",
         "locals": "variables of learn()",
         "globals": "variables of SB3's module",
-        "pbar": "drawn anew",
-        "_renaming_logger": "a view of the logger",
     },
+    ProgressBarCallback: {"pbar": "drawn anew"},
     KVWriter: {"file": _FILE, "writer": _FILE},
-    Logger: {},
-    ReplayBuffer: {},
 }
 
 
@@ -144,12 +141,10 @@ def vec_envs(agent: OffPolicyAlgorithm, found: dict[str, Any]) -> Iterator[tuple
     """
     assert agent.env is not None
     yield "agent.env", agent.env
-    seen = {id(agent.env)}
-    for name, part in list(found.items()):
+    for name, part in found.items():
         if isinstance(part, BaseCallback | SearchPolicy):
             for attribute, value in vars(part).items():
-                if isinstance(value, VecEnv) and id(value) not in seen:
-                    seen.add(id(value))
+                if isinstance(value, VecEnv):
                     yield f"{name}.{attribute}", value
 
 

@@ -71,6 +71,25 @@ def codec_of(cls: type) -> Codec | None:
     return _codecs.get(cls)
 
 
+def in_section(section: str, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Name arrays as one of several sections of a file.
+
+    :param section: its name.
+    :param arrays: by name.
+    """
+    return {f"{section}|{name}": array for name, array in arrays.items()}
+
+
+def of_section(section: str, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the arrays that :func:`in_section` named.
+
+    :param section: its name.
+    :param arrays: of all sections.
+    """
+    start = f"{section}|"
+    return {name.removeprefix(start): array for name, array in arrays.items() if name.startswith(start)}
+
+
 class Encoder:
     """Turns frozen values into data.
 

@@ -11,7 +11,7 @@ from stable_baselines3.common.monitor import Monitor
 
 from sb3_mcbs.checkpoints.encoding import Decoder, Encoded, Encoder, register_state
 from sb3_mcbs.checkpoints.errors import CheckpointError
-from sb3_mcbs.checkpoints.files import read_written, write_again
+from sb3_mcbs.checkpoints.files import read_written, results_file, write_again
 from sb3_mcbs.checkpoints.names import known_names
 from sb3_mcbs.snapshot import Snapshot, SnapshotEnvWrapper, SnapshotError
 from sb3_mcbs.snapshot.replay import Episode
@@ -93,8 +93,9 @@ def restore_environment(wrapper: SnapshotEnvWrapper, encoded: Encoded, classes: 
     monitors = list(_monitors(wrapper))
     for monitor, (t_start, written) in zip(monitors, content["monitors"], strict=False):
         monitor.t_start = t_start
-        if monitor.results_writer is not None and written is not None:
-            write_again(monitor.results_writer.file_handler, written)
+        file = results_file(monitor)
+        if file is not None and written is not None:
+            write_again(file, written)
     if content["generators"] is not None:
         set_generators(content["generators"])
 
@@ -107,7 +108,8 @@ def _monitors(env: gym.Env) -> Iterator[Monitor]:
 
 
 def _written(monitor: Monitor) -> np.ndarray | None:
-    return None if monitor.results_writer is None else read_written(monitor.results_writer.file_handler)
+    file = results_file(monitor)
+    return None if file is None else read_written(file)
 
 
 def describe_environment(wrapper: SnapshotEnvWrapper) -> dict[str, Any] | None:
@@ -131,9 +133,9 @@ def describe_environment(wrapper: SnapshotEnvWrapper) -> dict[str, Any] | None:
         "monitor": None,
     }
     if monitors:
-        writer = monitors[0].results_writer
+        file = results_file(monitors[0])
         description["monitor"] = {
-            "filename": None if writer is None else writer.file_handler.name,
+            "filename": None if file is None else file.name,
             "allow_early_resets": monitors[0].allow_early_resets,
             "reset_keywords": list(monitors[0].reset_keywords),
             "info_keywords": list(monitors[0].info_keywords),

@@ -14,6 +14,8 @@ from stable_baselines3.common.logger import (
     Logger,
     TensorBoardOutputFormat,
 )
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import VecMonitor
 
 from sb3_mcbs.checkpoints.errors import CheckpointError
 
@@ -41,6 +43,14 @@ def write_again(handle: Any, content: np.ndarray) -> None:
     handle.truncate()
     handle.write(content.tobytes().decode(handle.encoding))
     handle.flush()
+
+
+def results_file(monitor: Monitor | VecMonitor) -> IO[Any] | None:
+    """Return the file that a monitor writes episodes into, if it does.
+
+    :param monitor: SB3's ``Monitor`` or ``VecMonitor``.
+    """
+    return None if monitor.results_writer is None else monitor.results_writer.file_handler
 
 
 def describe_format(output_format: Any) -> tuple[str, str | None]:

@@ -62,19 +62,20 @@ class Interrupts:
 
     def end(self) -> None:
         """Give the signals back."""
-        for signum, handler in self._previous.items():
-            signal.signal(signum, handler)
-        self._previous = {}
+        self._give_back()
         for vec_env in self._workers:
             if not vec_env.closed:
                 vec_env.env_method("apply", _heed_signals)
         self._workers = []
 
+    def _give_back(self) -> None:
+        for signum, handler in self._previous.items():
+            signal.signal(signum, handler)
+        self._previous = {}
+
     def _note(self, signum: int, frame: FrameType | None) -> None:
         training = self._is_training(frame)
-        for each, handler in self._previous.items():
-            signal.signal(each, handler)
-        self._previous = {}
+        self._give_back()
         if not training:
             os.kill(os.getpid(), signum)
             return

@@ -9,21 +9,20 @@ from typing import Any
 
 import numpy as np
 import torch as th
-from sb3_contrib import TQC
 from sb3_contrib.tqc import policies as tqc_policies
-from stable_baselines3 import DDPG, SAC, TD3, HerReplayBuffer
+from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common import buffers, noise, running_mean_std, torch_layers, type_aliases, utils
 from stable_baselines3.common.vec_env import stacked_observations
 from stable_baselines3.her.goal_selection_strategy import GoalSelectionStrategy
 from stable_baselines3.sac import policies as sac_policies
 from stable_baselines3.td3 import policies as td3_policies
 
-from sb3_mcbs.algorithms import MCBSDDPG, MCBSSAC, MCBSTD3, MCBSTQC
+from sb3_mcbs.algorithms.load_agent import ALGORITHMS
 from sb3_mcbs.checkpoints.encoding import name_of
 from sb3_mcbs.snapshot.functions import FunctionName
 
 #: Agents whose whole state is known.
-AGENTS = (MCBSTD3, MCBSDDPG, MCBSSAC, MCBSTQC, TD3, DDPG, SAC, TQC)
+AGENTS = tuple(ALGORITHMS.values())
 
 _CLASSES: tuple[type, ...] = (
     np.float32, np.float64, np.int32, np.int64, np.uint8, np.bool_,

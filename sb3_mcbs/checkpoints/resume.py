@@ -9,14 +9,13 @@ from typing import Any, TypeVar
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 
-from sb3_mcbs.checkpoints.callback import folder_of
 from sb3_mcbs.checkpoints.errors import CheckpointError
 from sb3_mcbs.checkpoints.files import check_below
 from sb3_mcbs.checkpoints.names import known_names
 from sb3_mcbs.checkpoints.resumption import Resumption
 from sb3_mcbs.checkpoints.settings import log_files, make_agent, make_vec_env
 from sb3_mcbs.checkpoints.state import set_networks
-from sb3_mcbs.checkpoints.store import Store
+from sb3_mcbs.checkpoints.store import STEP, Store
 
 _Agent = TypeVar("_Agent", bound=OffPolicyAlgorithm)
 
@@ -56,8 +55,7 @@ def resume(
         if manifest["environment"] is None:
             raise CheckpointError(
                 "The run's environment takes more than its id and plain arguments (a wrapper, or an "
-                "object). Make "
-                "it as you did and pass it: resume(path, env=...)."
+                "object). Make it as you did and pass it: resume(path, env=...)."
             )
         for file in log_files(manifest["environment"]):
             check_below(file, roots)
@@ -91,10 +89,12 @@ def read_resumption(path: str | os.PathLike[str], classes: Iterable[Any] = ()) -
     :param path: as in :func:`resume`.
     :param classes: as in :func:`resume`.
     """
-    store = Store(folder_of(path))
-    if Path(path) != store.folder:
-        checkpoint = store.read(int(Path(path).name.removeprefix("step_")))
+    path = Path(path)
+    if path.name.startswith(STEP):
+        store = Store(path.parent)
+        checkpoint = store.read(int(path.name.removeprefix(STEP)))
     else:
+        store = Store(path)
         checkpoint = store.read_newest(lambda message: warnings.warn(message, stacklevel=4))
     return Resumption(store, checkpoint, tuple(classes))
 

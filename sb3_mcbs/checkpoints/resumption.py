@@ -10,7 +10,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_mcbs.checkpoints.buffers import write_rows
 from sb3_mcbs.checkpoints.components import callbacks
-from sb3_mcbs.checkpoints.encoding import Encoded
+from sb3_mcbs.checkpoints.encoding import Encoded, of_section
 from sb3_mcbs.checkpoints.errors import CheckpointError
 from sb3_mcbs.checkpoints.files import make_logger
 from sb3_mcbs.checkpoints.settings import check_settings, circumstances
@@ -19,6 +19,8 @@ from sb3_mcbs.checkpoints.store import Checkpoint, Store
 
 logger = logging.getLogger("sb3_mcbs")
 
+#: Section of a checkpoint's arrays.
+SETTINGS = "settings"
 _PENDING = "_resumption"
 #: Attributes that an agent has of its own until its run was resumed.
 _UNTIL_RESUMED = (_PENDING, "_setup_learn", "_excluded_save_params")
@@ -40,12 +42,7 @@ class Resumption:
     @property
     def settings(self) -> Encoded:
         """The settings of the saved agent."""
-        arrays = {
-            name.partition("|")[2]: array
-            for name, array in self.checkpoint.arrays.items()
-            if name.startswith("settings|")
-        }
-        return Encoded(self.checkpoint.manifest["settings"], arrays)
+        return Encoded(self.checkpoint.manifest["settings"], of_section(SETTINGS, self.checkpoint.arrays))
 
     def attach(self, agent: OffPolicyAlgorithm, roots: list[Path]) -> None:
         """Have an agent continue the run in its next ``learn``.

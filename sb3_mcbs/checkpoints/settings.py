@@ -1,5 +1,6 @@
 """How an agent and its environments were made, as data, and how to make them again."""
 
+import functools
 import inspect
 import platform
 from importlib.metadata import version
@@ -25,6 +26,7 @@ from sb3_mcbs.checkpoints.components import layers_of
 from sb3_mcbs.checkpoints.encoding import Decoder, Encoded, Encoder, name_of
 from sb3_mcbs.checkpoints.environments import describe_environment, make_environment
 from sb3_mcbs.checkpoints.errors import CheckpointError
+from sb3_mcbs.checkpoints.files import results_file
 from sb3_mcbs.checkpoints.kinds import KINDS, kind_of
 from sb3_mcbs.snapshot import SnapshotUnsupportedError
 from sb3_mcbs.snapshot.graph import Freezer, Thawer
@@ -54,8 +56,7 @@ def describe_agent(agent: OffPolicyAlgorithm) -> Encoded:
         if not hasattr(agent, attribute):
             raise CheckpointError(
                 f"{type(agent).__name__} keeps no attribute {attribute!r} for its parameter, so it could "
-                "not be "
-                "made again. Keep it."
+                "not be made again. Keep it."
             )
         value = getattr(agent, attribute)
         if value is NStepReplayBuffer and agent.n_steps > 1:
@@ -106,15 +107,15 @@ def describe_vec_env(vec_env: VecEnv) -> dict[str, Any] | None:
     :return: None if ids and plain arguments are not all that it takes.
     """
     *wrappers, base = layers_of(vec_env)
-    if type(base).__name__ not in _VEC_ENVS or type(base) not in _VEC_ENVS.values():
+    if type(base) not in _VEC_ENVS.values():
         return None
     layers: list[list[Any]] = []
     for layer in reversed(wrappers):
         if type(layer) is VecNormalize:
             layers.append(["VecNormalize", {name: getattr(layer, name) for name in _NORMALIZE}])
         elif type(layer) is VecMonitor:
-            writer = layer.results_writer
-            filename = None if writer is None else writer.file_handler.name
+            file = results_file(layer)
+            filename = None if file is None else file.name
             layers.append(["VecMonitor", {"filename": filename, "info_keywords": list(layer.info_keywords)}])
         elif type(layer) is not VecTransposeImage:  # which SB3 adds by itself
             return None
@@ -184,6 +185,7 @@ def circumstances(agent: OffPolicyAlgorithm) -> dict[str, Any]:
     }
 
 
+@functools.cache
 def _version(package: str) -> str | None:
     try:
         return version(package)

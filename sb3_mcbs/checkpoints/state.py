@@ -8,11 +8,11 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecMonitor
 
 from sb3_mcbs.algorithms.vec_env_view import snapshot_environments
 from sb3_mcbs.checkpoints.components import components, layers_of, not_state_of
-from sb3_mcbs.checkpoints.encoding import Decoder, Encoded, Encoder
+from sb3_mcbs.checkpoints.encoding import Decoder, Encoded, Encoder, in_section, of_section
 from sb3_mcbs.checkpoints.environments import (
     capture_environment,
     read_generators,
@@ -20,7 +20,7 @@ from sb3_mcbs.checkpoints.environments import (
     set_generators,
 )
 from sb3_mcbs.checkpoints.errors import CheckpointError
-from sb3_mcbs.checkpoints.files import file_of, read_written, write_again
+from sb3_mcbs.checkpoints.files import file_of, read_written, results_file, write_again
 from sb3_mcbs.checkpoints.kinds import KINDS, kind_of
 from sb3_mcbs.checkpoints.names import known_names
 from sb3_mcbs.models import Environments, WorkerEnvironments
@@ -29,7 +29,7 @@ from sb3_mcbs.snapshot.attributes import freeze_attributes, thaw_attributes
 from sb3_mcbs.snapshot.graph import Freezer, Ref, Thawer, class_name
 
 RUN = "run"
-_POLICY = "policy|"
+_POLICY = "policy"
 
 
 class Captured(NamedTuple):
@@ -55,7 +55,6 @@ class RunState:
 
     def __init__(self, agent: OffPolicyAlgorithm, callback: BaseCallback) -> None:
         self._agent = agent
-        self._callback = callback
         self._components = components(agent, callback)
         self._bases = self._find_bases()
         self._environments: dict[str, Environments] = {
@@ -89,13 +88,10 @@ class RunState:
             in_workers = isinstance(environments, WorkerEnvironments)
             captured = environments.apply(range(len(environments)), capture_environment, in_workers)
             sections |= {f"{name}[{index}]": encoded for index, encoded in enumerate(captured)}
-        arrays = {
-            f"{section}|{dtype}": array
-            for section, encoded in sections.items()
-            for dtype, array in encoded.arrays.items()
-        }
-        for name, tensor in self._agent.policy.state_dict().items():
-            arrays[_POLICY + name] = tensor.cpu().numpy()
+        networks = self._agent.policy.state_dict()
+        arrays = in_section(_POLICY, {name: tensor.cpu().numpy() for name, tensor in networks.items()})
+        for section, encoded in sections.items():
+            arrays |= in_section(section, encoded.arrays)
         return Captured({section: encoded.json for section, encoded in sections.items()}, arrays)
 
     def restore(self, captured: Captured, classes: tuple[Any, ...] = ()) -> None:
@@ -184,8 +180,7 @@ class RunState:
     def _file(self, part: Any) -> Any:
         if isinstance(part, KVWriter):
             return file_of(part)
-        writer = vars(part).get("results_writer") if isinstance(part, VecEnv) else None
-        return None if writer is None else writer.file_handler
+        return results_file(part) if isinstance(part, VecMonitor) else None
 
     def _written(self, part: Any) -> np.ndarray | None:
         file = self._file(part)
@@ -199,11 +194,7 @@ def set_networks(agent: OffPolicyAlgorithm, arrays: dict[str, np.ndarray]) -> No
     :param arrays: of :class:`Captured`.
     :raises CheckpointError: if they are other networks.
     """
-    tensors = {
-        name.removeprefix(_POLICY): th.from_numpy(array)
-        for name, array in arrays.items()
-        if name.startswith(_POLICY)
-    }
+    tensors = {name: th.from_numpy(array) for name, array in of_section(_POLICY, arrays).items()}
     try:
         agent.policy.load_state_dict(tensors)
     except RuntimeError as error:
@@ -213,9 +204,7 @@ def set_networks(agent: OffPolicyAlgorithm, arrays: dict[str, np.ndarray]) -> No
 
 
 def _section(captured: Captured, name: str) -> Encoded:
-    start = f"{name}|"
-    arrays = {key[len(start) :]: array for key, array in captured.arrays.items() if key.startswith(start)}
-    return Encoded(captured.json[name], arrays)
+    return Encoded(captured.json[name], of_section(name, captured.arrays))
 
 
 def _refusal(name: str, part: Any, error: Exception) -> str:

@@ -23,7 +23,7 @@ from sb3_mcbs.checkpoints.errors import CheckpointError
 FORMAT = 1
 MANIFEST, STATE, ARRAYS, ROWS = "manifest.json", "state.json", "arrays.npz", "rows"
 _UNFINISHED = ".unfinished-"
-_PREFIX = "step_"
+STEP = "step_"
 #: More than any manifest needs: a file from a stranger is not read without a limit.
 _MAX_MANIFEST = 16 * 2**20
 
@@ -139,8 +139,8 @@ class Store:
 
     def steps(self) -> list[int]:
         """Return the environment steps at which there are checkpoints, newest first."""
-        names = [path.name for path in self.folder.glob(_PREFIX + "*")] if self.folder.is_dir() else []
-        numbers = [name.removeprefix(_PREFIX) for name in names]
+        names = [path.name for path in self.folder.glob(STEP + "*")] if self.folder.is_dir() else []
+        numbers = [name.removeprefix(STEP) for name in names]
         return sorted((int(number) for number in numbers if number.isdecimal()), reverse=True)
 
     def path_of(self, step: int) -> Path:
@@ -148,7 +148,7 @@ class Store:
 
         :param step: environment steps.
         """
-        return self.folder / f"{_PREFIX}{step:012d}"
+        return self.folder / f"{STEP}{step:012d}"
 
     def write_rows(self, first: int, end: int, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
         """Write rows of the replay buffer.

@@ -60,6 +60,9 @@ class SecondEvalCallback(EvalCallback):
     :param eval_kwargs: the other arguments of ``EvalCallback``
     """
 
+    #: A view of the agent's logger.
+    not_checkpointed = ("_renaming_logger",)
+
     def __init__(
         self,
         eval_env: Any,

@@ -12,18 +12,12 @@ from functools import partial
 from types import CodeType, ModuleType
 from typing import Any
 
-from stable_baselines3.common.base_class import BaseAlgorithm
-
-from sb3_mcbs.algorithms import MCBSDDPG, MCBSSAC, MCBSTD3, MCBSTQC
+from sb3_mcbs.algorithms.load_agent import ALGORITHMS as KNOWN_ALGORITHMS
+from sb3_mcbs.algorithms.mcbs import MCBS
 from sb3_mcbs.zoo.sampler import convert_mcbs_params, sample_mcbs_params
 
 #: Our algorithms under their names on RL Zoo's command line.
-ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
-    "mcbs_td3": MCBSTD3,
-    "mcbs_ddpg": MCBSDDPG,
-    "mcbs_sac": MCBSSAC,
-    "mcbs_tqc": MCBSTQC,
-}
+ALGORITHMS = {name: cls for name, cls in KNOWN_ALGORITHMS.items() if issubclass(cls, MCBS)}
 #: By these names, and others beside them, RL Zoo's commands know the algorithms that have a replay buffer.
 OFF_POLICY = frozenset(("ddpg", "sac", "td3", "tqc"))
 
