@@ -2,13 +2,12 @@
 
 import inspect
 import re
-from dataclasses import fields
 from typing import get_type_hints
 
 import pytest
 
-from sb3_mcbs import MCBS, MCBSSAC, SearchSettings
-from sb3_mcbs.algorithms.mcbs import SearchKeywords
+from sb3_mcbs import MCBS, MCBSSAC
+from sb3_mcbs.algorithms.keywords import SearchKeywords, setting_fields
 from sb3_mcbs.algorithms.td3_update import FastUpdate
 from tests.conftest import SEARCHING, SMALL_SEARCH, WITHOUT_SEARCH
 
@@ -27,7 +26,7 @@ def test_parameters_are_sb3s_in_their_order_and_then_the_searchs(cls):
         assert (ours[name].default, ours[name].kind) == (parameter.default, parameter.kind), name
     others = {name: ours[name] for name in list(ours)[len(theirs) :]}
     assert {parameter.kind for parameter in others.values()} == {inspect.Parameter.KEYWORD_ONLY}
-    search = {field.name: field.default for field in fields(SearchSettings)}
+    search = {field.name: field.default for field in setting_fields()}
     assert others.keys() == search.keys() | own_settings(cls)
     assert {name: others[name].default for name in search} == search
     assert inspect.signature(cls).parameters.keys() == ours.keys() - {"self"}
@@ -38,13 +37,13 @@ def test_every_parameter_is_documented_once_and_kept(make_agent, cls):
     parameters = list(inspect.signature(cls).parameters)
     assert re.findall(r"^:param (\w+):", inspect.cleandoc(cls.__doc__), re.MULTILINE) == parameters
     agent = make_agent(cls=cls)
-    for name in {*SearchSettings.names(), *own_settings(cls)}:
+    for name in {*(field.name for field in setting_fields()), *own_settings(cls)}:
         assert hasattr(agent, name), name
     assert {name: getattr(agent, name) for name in SMALL_SEARCH} == SMALL_SEARCH
 
 
 def test_type_checkers_know_every_setting():
-    types = {field.name: field.type for field in fields(SearchSettings)}
+    types = {field.name: field.type for field in setting_fields()}
     assert get_type_hints(SearchKeywords) == types
     assert {name: hint for name, hint in get_type_hints(MCBS).items() if name in types} == types
 

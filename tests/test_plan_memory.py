@@ -18,25 +18,25 @@ PLANS = np.arange(1, 13, dtype=np.float32).reshape(2, 3, 2)
 
 def kept(moments) -> PlanMemory:
     memory = PlanMemory(2, 3, 2)
-    memory.keep(PLANS, moments)
+    memory.keep(PLANS, [0, 1], moments)
     return memory
 
 
 def test_plans_are_shifted_by_the_steps_since_then():
     memory = kept([(1, 5), (4, 0)])
-    np.testing.assert_array_equal(memory.recall([(1, 5), (4, 0)]), PLANS)
-    recalled = memory.recall([(1, 6), (4, 2)])
+    np.testing.assert_array_equal(memory.recall([0, 1], [(1, 5), (4, 0)]), PLANS)
+    recalled = memory.recall([0, 1], [(1, 6), (4, 2)])
     np.testing.assert_array_equal(recalled[0], [*PLANS[0, 1:], [0, 0]])
     np.testing.assert_array_equal(recalled[1], [PLANS[1, 2], [0, 0], [0, 0]])
-    assert not memory.recall([(1, 8), (4, 1000)]).any(), "nothing is left of them"
+    assert not memory.recall([0, 1], [(1, 8), (4, 1000)]).any(), "nothing is left of them"
 
 
 def test_plans_are_dropped_where_an_episode_ended():
     memory = kept([(1, 5), (4, 0)])
-    recalled = memory.recall([(2, 6), (4, 1)])
+    recalled = memory.recall([0, 1], [(2, 6), (4, 1)])
     assert not recalled[0].any() and recalled[1].any()
-    assert not memory.recall([(1, 4), (5, 1)]).any(), "nor is a plan recalled from the future"
-    assert not PlanMemory(2, 3, 2).recall([(0, 0), (0, 0)]).any(), "nor one that never was"
+    assert not memory.recall([0, 1], [(1, 4), (5, 1)]).any(), "nor is a plan recalled from the future"
+    assert not PlanMemory(2, 3, 2).recall([0, 1], [(0, 0), (0, 0)]).any(), "nor one that never was"
 
 
 def test_the_state_is_plain_and_independent_of_earlier_resets():
@@ -45,11 +45,11 @@ def test_the_state_is_plain_and_independent_of_earlier_resets():
     assert state["ages"] == [1, -1]
     other = PlanMemory(2, 3, 2)
     other.set_state(state, [(1, 0), (1, 0)])  # just restored from a snapshot
-    recalled = other.recall([(1, 0), (1, 0)])
-    np.testing.assert_array_equal(recalled[0], memory.recall([(7, 6), (5, 0)])[0])
+    recalled = other.recall([0, 1], [(1, 0), (1, 0)])
+    np.testing.assert_array_equal(recalled[0], memory.recall([0, 1], [(7, 6), (5, 0)])[0])
     assert not recalled[1].any()
-    assert other.recall([(1, 1), (1, 1)])[0, 0].tolist() == PLANS[0, 2].tolist()
-    assert not other.recall([(2, 0), (2, 0)]).any()
+    assert other.recall([0, 1], [(1, 1), (1, 1)])[0, 0].tolist() == PLANS[0, 2].tolist()
+    assert not other.recall([0, 1], [(2, 0), (2, 0)]).any()
 
 
 def test_a_wrapper_tells_moments_apart():
@@ -72,9 +72,9 @@ def test_decisions_start_around_what_is_left_of_the_last_plan():
     settings = SearchSettings(8, 3, strategy="refine", beam_noise=0.3)
     memory, rng, x = PlanMemory(1, 3, 1), np.random.default_rng(0), 1.0
     for moment in [(1, 0), (1, 1), (1, 2), (2, 0), (2, 2)]:
-        expected = AGENT.policy(np.array([[x]])) + memory.recall([moment])[:, 0]
+        expected = AGENT.policy(np.array([[x]])) + memory.recall([0], [moment])[:, 0]
         result = search(
-            Decision(LineWorld(), [x], np.array([[x]]), AGENT, settings, (1, 1), rng, memory, [moment])
+            Decision(LineWorld(), [x], np.array([[x]]), AGENT, settings, (1, 1), rng, memory, [0], [moment])
         )
         np.testing.assert_allclose(result.candidates[0, 0], np.clip(expected[0], -1, 1), rtol=1e-6)
         is_policy = result.candidates[0, 0] == AGENT.policy(np.array([[x]]))[0]
@@ -85,9 +85,9 @@ def test_decisions_start_around_what_is_left_of_the_last_plan():
 REFINE = dict(strategy="refine", beam_width=4, rollout_depth=3, n_rounds=2, n_simulations=1, beam_noise=0.3)
 
 
-def recalled(policy: SearchPolicy) -> np.ndarray:
-    searcher = policy.searcher
-    return searcher._plans.recall(searcher._moments())
+def recalled(searcher) -> np.ndarray:
+    everywhere = searcher._all_envs
+    return searcher._plans.recall(everywhere, searcher._moments(everywhere))
 
 
 @pytest.mark.parametrize("vec_env_cls", [DummyVecEnv, SubprocVecEnv])
@@ -97,17 +97,17 @@ def test_episodes_of_vectorized_environments(make_agent, vec_env_cls):
     env = snapshot_vec_env("InvertedPendulum-v5", 2, vec_env_cls=vec_env_cls)
     policy = SearchPolicy(agent, env, seed=0, **REFINE)
     observations = env.reset()
-    assert not recalled(policy).any()
+    assert not recalled(policy.searcher).any()
     ends = [0, 0]
     for _ in range(25):
         policy.predict(observations)
         # Full force to either side, so that both poles fall, one after the other.
         observations, _, dones, _ = env.step(np.array([[3.0], [-2.0]], dtype=np.float32))
-        np.testing.assert_array_equal(recalled(policy).any(axis=(1, 2)), ~dones)
+        np.testing.assert_array_equal(recalled(policy.searcher).any(axis=(1, 2)), ~dones)
         ends = [count + int(done) for count, done in zip(ends, dones, strict=True)]
     assert min(ends) > 0
     env.reset()
-    assert not recalled(policy).any()
+    assert not recalled(policy.searcher).any()
     policy.close()
     env.close()
 
@@ -147,7 +147,7 @@ def test_a_restored_search_goes_on_as_if_it_had_never_stopped(make_agent):
     env_b.envs[0].restore(snapshot)
     policy_b.searcher.memory = memory
     policy_b.rng.bit_generator.state = policy.rng.bit_generator.state
-    np.testing.assert_array_equal(recalled(policy_b), recalled(policy))
+    np.testing.assert_array_equal(recalled(policy_b.searcher), recalled(policy.searcher))
     expected, _ = policy.predict(observations)
     actions, _ = policy_b.predict(observations)
     np.testing.assert_array_equal(actions, expected)
@@ -164,7 +164,8 @@ def test_agents_train_with_every_strategy(make_agent, strategy, make_dict_env):
     )
     agent.learn(40)
     assert agent.n_decisions == 20 and agent.n_simulated_steps > 0
-    assert agent._searcher._plans is None or agent._searcher._plans.ages(agent._searcher._moments()) == [1]
+    state = agent._searcher.memory["plans"]
+    assert state is None or state["ages"] == [1]
 
 
 @pytest.mark.parametrize("env_id, n_envs", [("Pendulum-v1", 1), ("InvertedPendulum-v5", 2)])
@@ -176,6 +177,4 @@ def test_a_run_that_is_resumed_remembers_its_plans(make_agent, tmp_path, env_id,
     whole, resumed = assert_resumed_is_exact(
         make, tmp_path, 90, 65, make_env=lambda folder: snapshot_vec_env(env_id, n_envs)
     )
-    np.testing.assert_array_equal(
-        *(agent._searcher._plans.recall(agent._searcher._moments()) for agent in (whole, resumed))
-    )
+    np.testing.assert_array_equal(*(recalled(agent._searcher) for agent in (whole, resumed)))

@@ -157,7 +157,7 @@ def test_searched_action_is_executed_and_stored_as_it_is(make_agent, cls):
     chosen = []
     agent._setup_learn(1)
     search = agent._searcher.search
-    agent._searcher.search = lambda obs, rng: chosen.append(search(obs, rng)) or chosen[-1]
+    agent._searcher.search = lambda *args: chosen.append(search(*args)) or chosen[-1]
     agent.learn(40)
     assert len(chosen) == 20
     searched = np.concatenate([result.actions for result in chosen])

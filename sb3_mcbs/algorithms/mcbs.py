@@ -1,16 +1,18 @@
 """What makes an off-policy agent look ahead before it acts, whatever it learns by."""
 
-import inspect
+import logging
 import time
-from collections.abc import Mapping
-from dataclasses import fields
-from typing import Any, TypedDict, TypeVar
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
+from sb3_contrib import TQC
+from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.noise import ActionNoise, NormalActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
@@ -22,42 +24,17 @@ from sb3_mcbs.algorithms.faults import (
     leave_out_step,
     warn_of_divergence,
 )
+from sb3_mcbs.algorithms.keywords import SearchAttributes, list_search_settings, setting_fields
 from sb3_mcbs.algorithms.searcher import Searcher
 from sb3_mcbs.algorithms.torch_settings import matmul_precision
-from sb3_mcbs.search import SearchResult, SearchSettings
+from sb3_mcbs.search import ScheduleSettings, SearchResult, SearchSchedule, SearchSettings
+
+logger = logging.getLogger("sb3_mcbs")
 
 SelfMCBS = TypeVar("SelfMCBS", bound="MCBS")
 
-_SEARCH_SETTINGS = "search_settings"
 
-
-class SearchKeywords(TypedDict, total=False):
-    """The fields of :class:`~sb3_mcbs.SearchSettings` as keyword arguments, for type checkers."""
-
-    beam_width: int
-    rollout_depth: int
-    n_simulations: int
-    beam_noise: float
-    rollout_noise: float | None
-    noise_clip: float | None
-    include_policy_action: bool
-    n_threads: int
-    forward_model: str
-    matmul_precision: str | None
-    time_budget: float | None
-    max_beam_width: int | None
-    strategy: str
-    n_proposals: int | None
-    common_noise: bool
-    antithetic: bool
-    branching: int
-    one_node_per_root: bool
-    n_rounds: int
-    n_elites: int | None
-    min_noise: float
-
-
-class MCBS(OffPolicyAlgorithm):
+class MCBS(SearchAttributes, OffPolicyAlgorithm):
     """
     Monte Carlo Beam Search for an off-policy agent of SB3: the mixin that stands before it.
 
@@ -74,51 +51,31 @@ class MCBS(OffPolicyAlgorithm):
     docstring of such a class the settings are listed one by one where ``search_settings`` was written.
     """
 
-    beam_width: int
-    rollout_depth: int
-    n_simulations: int
-    beam_noise: float
-    rollout_noise: float | None
-    noise_clip: float | None
-    include_policy_action: bool
-    n_threads: int
-    forward_model: str
-    matmul_precision: str | None
-    time_budget: float | None
-    max_beam_width: int | None
-    strategy: str
-    n_proposals: int | None
-    common_noise: bool
-    antithetic: bool
-    branching: int
-    one_node_per_root: bool
-    n_rounds: int
-    n_elites: int | None
-    min_noise: float
-
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        _list_search_settings(cls)
+        list_search_settings(cls)
 
     def _init_search(self, action_noise_after_search: bool, settings: Mapping[str, object]) -> None:
         """
         Take over the constructor's arguments for the search.
 
         :param action_noise_after_search: add ``action_noise`` to searched actions too
-        :param settings: fields of :class:`~sb3_mcbs.SearchSettings`; those not given have their defaults
+        :param settings: fields of :data:`SETTINGS`; those not given have their defaults
         :raises TypeError: if there is no such setting
         """
-        unknown = sorted(settings.keys() - set(SearchSettings.names()))
+        known = {field.name: field.default for field in setting_fields()}
+        unknown = sorted(settings.keys() - known.keys())
         if unknown:
             raise TypeError(
                 f"{type(self).__name__} got unexpected keyword arguments {unknown}; the settings of the "
-                f"search are {list(SearchSettings.names())}."
+                f"search are {list(known)}."
             )
-        for field in fields(SearchSettings):
-            setattr(self, field.name, settings.get(field.name, field.default))
+        for name, default in known.items():
+            setattr(self, name, settings.get(name, default))
         self.action_noise_after_search = action_noise_after_search
 
         self.search_rng: np.random.Generator | None = None
+        self._schedule: SearchSchedule | None = None
         self.n_decisions = 0
         self.n_simulated_steps = 0
         self.n_invalid_rollouts = 0
@@ -126,6 +83,7 @@ class MCBS(OffPolicyAlgorithm):
         self.n_diverged_steps = 0
         self._searcher: Searcher | None = None
         self._decision: SearchResult | None = None
+        self._searched: Sequence[int] = ()
         self._checked_env: CheckedVecEnv | None = None
 
     @property
@@ -133,9 +91,15 @@ class MCBS(OffPolicyAlgorithm):
         """The settings of the search, checked."""
         return SearchSettings.of(self)
 
+    @property
+    def schedule_settings(self) -> ScheduleSettings:
+        """The settings of the search's schedule, checked."""
+        return ScheduleSettings.of(self)
+
     def _setup_model(self) -> None:
         # ``load`` sets attributes without calling the constructor, so settings are checked here.
-        settings = self.search_settings
+        settings, schedule = self.search_settings, self.schedule_settings
+        schedule.check_search(settings)
         if not isinstance(self.action_noise_after_search, bool):
             raise TypeError(
                 f"action_noise_after_search must be True or False, got {self.action_noise_after_search!r}."
@@ -143,6 +107,9 @@ class MCBS(OffPolicyAlgorithm):
         super()._setup_model()
         if self.search_rng is None:
             self.search_rng = np.random.default_rng(self.seed)
+        if self._schedule is None:
+            self._schedule = SearchSchedule(schedule, self.seed)
+        self._schedule.settings = schedule
         if self.env is not None:
             self._make_searcher(self.env, settings)
 
@@ -165,6 +132,8 @@ class MCBS(OffPolicyAlgorithm):
         super().set_random_seed(seed)
         if seed is not None:
             self.search_rng = np.random.default_rng(seed)
+            if self._schedule is not None:
+                self._schedule.rng = np.random.default_rng(seed)
 
     def _sample_action(
         self,
@@ -173,30 +142,57 @@ class MCBS(OffPolicyAlgorithm):
         n_envs: int = 1,
     ) -> tuple[np.ndarray, np.ndarray]:
         """
-        Search for the next actions, or sample them as the agent without search before ``learning_starts``.
+        Search for the next actions, or sample them as the agent without search: before ``learning_starts``,
+        and in environments that the schedule leaves out.
 
-        :param action_noise: noise for actions that were not searched
         :param learning_starts: Number of steps before learning for the warm-up phase.
+        :param action_noise: noise for actions that were not searched
         :param n_envs: number of environments
         :return: actions ``[n_envs, *act_shape]`` to take in the environment
             and scaled actions that will be stored in the replay buffer.
         """
         self._decision = None
-        if self.num_timesteps < learning_starts:
-            return super()._sample_action(learning_starts, action_noise, n_envs)
+        # For all environments whatever is searched, so that random streams do not depend on the schedule.
+        noise = None if action_noise is None else _DrawnNoise(action_noise)
+        actions, scaled_actions = super()._sample_action(learning_starts, noise, n_envs)
+        self._searched = self._draw_searched(learning_starts)
+        if not self._searched:
+            return actions, scaled_actions
 
         assert self._last_obs is not None, "self._last_obs was not set"
         assert self._searcher is not None and self.search_rng is not None, "learn() needs an environment"
+        assert self._schedule is not None
+        effort = self._schedule.effort(self._searcher.settings, self._progress)
         start = time.perf_counter()
-        result = self._searcher.search(self._last_obs, self.search_rng)
-        self._record_decision(result, time.perf_counter() - start)
+        result = self._searcher.search(self._last_obs, self.search_rng, self._searched, effort)
+        self._record_decision(result, time.perf_counter() - start, effort)
 
-        scaled_action = result.actions.reshape(-1, *(self.action_space.shape or ()))
-        if self.action_noise_after_search and action_noise is not None:
-            noisy_action = np.clip(scaled_action + action_noise(), -1, 1).astype(scaled_action.dtype)
-            return self.policy.unscale_action(noisy_action), noisy_action
-        self._decision = result
-        return self.policy.unscale_action(scaled_action), scaled_action
+        found = result.actions.reshape(-1, *(self.action_space.shape or ()))
+        if self.action_noise_after_search and noise is not None:
+            drawn = np.broadcast_to(noise.last, scaled_actions.shape)[self._searched]
+            found = np.clip(found + drawn, -1, 1).astype(found.dtype)
+        else:
+            self._decision = result
+        if len(self._searched) == n_envs:
+            return self.policy.unscale_action(found), found
+        # Of one kind, so that searched actions reach the environments as they were simulated.
+        actions, scaled_actions = actions.astype(found.dtype), scaled_actions.astype(found.dtype)
+        actions[self._searched] = self.policy.unscale_action(found)
+        scaled_actions[self._searched] = found
+        return actions, scaled_actions
+
+    @property
+    def _progress(self) -> float:
+        """How much of the training is done, from 0 to 1."""
+        return 1.0 - self._current_progress_remaining
+
+    def _draw_searched(self, learning_starts: int) -> Sequence[int]:
+        """Which environments are searched now."""
+        if self.num_timesteps < learning_starts:
+            return ()
+        assert self._schedule is not None
+        self.logger.record("search/frequency", self._schedule.share(self._progress))
+        return np.flatnonzero(self._schedule.draw(self._progress, self.num_timesteps)).tolist()
 
     def _store_transition(
         self,
@@ -207,6 +203,10 @@ class MCBS(OffPolicyAlgorithm):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
+        normalizer = self._vec_normalize_env
+        raw_reward = reward if normalizer is None else normalizer.get_original_reward()
+        assert self._schedule is not None
+        self._schedule.note_step(raw_reward, dones, self.num_timesteps)
         diverged = diverged_environments(infos)
         if diverged and self.n_diverged_steps == 0:
             warn_of_divergence(buffer_action, diverged, self.num_timesteps)
@@ -217,9 +217,7 @@ class MCBS(OffPolicyAlgorithm):
             return
         if self._decision is not None:
             assert self._searcher is not None
-            normalizer = self._vec_normalize_env
-            raw_reward = reward if normalizer is None else normalizer.get_original_reward()
-            error = self._searcher.model_error(self._decision, new_obs, raw_reward, infos)
+            error = self._searcher.model_error(self._decision, self._searched, new_obs, raw_reward, infos)
             if error is not None:
                 self.logger.record_mean("search/model_error", error)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
@@ -229,10 +227,36 @@ class MCBS(OffPolicyAlgorithm):
             self._checked_env = CheckedVecEnv(env)
         return super().collect_rollouts(self._checked_env, *args, **kwargs)
 
-    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
-        result = super()._setup_learn(*args, **kwargs)
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        *args: Any,
+        **kwargs: Any,
+    ) -> tuple[int, BaseCallback]:
+        self._explore_without_search()
+        will_reset = reset_num_timesteps or self._last_obs is None
+        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args, **kwargs)
         check_observations(self._last_obs)
+        if will_reset:
+            assert self._schedule is not None
+            self._schedule.begin_episodes(self.n_envs, self.num_timesteps)
         return result
+
+    def _explore_without_search(self) -> None:
+        """Give a deterministic actor noise for what is not searched, if it has none."""
+        deterministic = not isinstance(self, SAC | TQC)
+        if self.action_noise is None and deterministic and not self.schedule_settings.searches_always:
+            message = (
+                f"action_noise is None and search_share leaves decisions to the actor: Gaussian noise of "
+                f"beam_noise={self.beam_noise} acts there. Pass an action_noise to choose another."
+            )
+            logger.info(message)
+            if self.verbose >= 1:
+                print(message)
+            n_actions = get_action_dim(self.action_space)
+            self.action_noise = NormalActionNoise(np.zeros(n_actions), np.full(n_actions, self.beam_noise))
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
         """
@@ -244,7 +268,7 @@ class MCBS(OffPolicyAlgorithm):
         with matmul_precision(self.matmul_precision):
             super().train(gradient_steps, batch_size)
 
-    def _record_decision(self, result: SearchResult, seconds: float) -> None:
+    def _record_decision(self, result: SearchResult, seconds: float, effort: SearchSettings) -> None:
         n_envs = len(result.chosen)
         self.n_decisions += n_envs
         self.n_simulated_steps += result.simulated_steps
@@ -263,6 +287,8 @@ class MCBS(OffPolicyAlgorithm):
             self.logger.record_mean("search/candidates", result.values.shape[1])
         if result.surviving_roots is not None:
             self.logger.record_mean("search/surviving_roots", float(result.surviving_roots.mean()))
+        self.logger.record("search/beam_width", effort.beam_width)
+        self.logger.record("search/rollout_depth", effort.rollout_depth)
         self.logger.record("search/critic_evaluations", self.n_critic_evaluations)
         self.logger.record("search/decisions", self.n_decisions)
         self.logger.record("search/simulated_steps", self.n_simulated_steps)
@@ -334,26 +360,19 @@ class MCBS(OffPolicyAlgorithm):
         return [*super()._excluded_save_params(), "_searcher", "_decision", "_checked_env"]
 
 
-def _list_search_settings(cls: type[MCBS]) -> None:
-    """Put the search settings one by one where the constructor has them as ``**search_settings``.
+class _DrawnNoise(ActionNoise):
+    """Noise that remembers what it drew last.
 
-    ``help``, :mod:`inspect` and exact checkpoints then see them like SB3's own parameters.
+    :param noise: the noise.
 
-    :param cls: changed in place; nothing is done for a class without that parameter.
+    :ivar last: what it drew last.
     """
-    init: Any = cls.__dict__.get("__init__")
-    signature = None if init is None else inspect.signature(init)
-    if signature is None or _SEARCH_SETTINGS not in signature.parameters:
-        return
-    listed = [
-        inspect.Parameter(
-            field.name, inspect.Parameter.KEYWORD_ONLY, default=field.default, annotation=field.type
-        )
-        for field in fields(SearchSettings)
-    ]
-    *others, _ = signature.parameters.values()
-    init.__signature__ = signature.replace(parameters=[*others, *listed])
-    if cls.__doc__ and SearchSettings.__doc__:  # there are none under ``python -OO``
-        before, _, _ = inspect.cleandoc(cls.__doc__).partition(f":param {_SEARCH_SETTINGS}:")
-        _, first, after = inspect.cleandoc(SearchSettings.__doc__).partition(":param ")
-        cls.__doc__ = before + first + after.partition(":raises ")[0]
+
+    def __init__(self, noise: ActionNoise) -> None:
+        super().__init__()
+        self._noise = noise
+        self.last = np.zeros(1)
+
+    def __call__(self) -> np.ndarray:
+        self.last = self._noise()
+        return self.last

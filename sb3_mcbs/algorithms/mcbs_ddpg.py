@@ -9,7 +9,8 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.td3.policies import TD3Policy
 
-from sb3_mcbs.algorithms.mcbs import MCBS, SearchKeywords
+from sb3_mcbs.algorithms.keywords import SearchKeywords
+from sb3_mcbs.algorithms.mcbs import MCBS
 from sb3_mcbs.algorithms.td3_update import FastUpdate
 
 
@@ -54,7 +55,8 @@ class MCBSDDPG(MCBS, FastUpdate, DDPG):
     :param action_noise_after_search: add ``action_noise`` to searched actions too
     :param fast_update: do gradient steps with SB3's mathematics but fewer instructions, where the networks
         are plain MLPs; others use SB3's own
-    :param search_settings: the fields of :class:`~sb3_mcbs.SearchSettings`
+    :param search_settings: the fields of :class:`~sb3_mcbs.SearchSettings` and
+        :class:`~sb3_mcbs.search.ScheduleSettings`
     """
 
     def __init__(

@@ -9,7 +9,8 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.sac.policies import SACPolicy
 
-from sb3_mcbs.algorithms.mcbs import MCBS, SearchKeywords
+from sb3_mcbs.algorithms.keywords import SearchKeywords
+from sb3_mcbs.algorithms.mcbs import MCBS
 
 
 class MCBSSAC(MCBS, SAC):
@@ -63,7 +64,8 @@ class MCBSSAC(MCBS, SAC):
     :param device: Device (cpu, cuda, ...) on which the networks run; simulation is on the CPU
     :param _init_setup_model: Whether or not to build the network at the creation of the instance
     :param action_noise_after_search: add ``action_noise`` to searched actions too
-    :param search_settings: the fields of :class:`~sb3_mcbs.SearchSettings`
+    :param search_settings: the fields of :class:`~sb3_mcbs.SearchSettings` and
+        :class:`~sb3_mcbs.search.ScheduleSettings`
     """
 
     def __init__(

@@ -2,6 +2,7 @@
 
 import logging
 import warnings
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,7 @@ from sb3_mcbs.search import (
     deadline_search,
     search,
 )
+from sb3_mcbs.search.interface import take_rows
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 
 logger = logging.getLogger("sb3_mcbs")
@@ -68,7 +70,7 @@ class Searcher:
         if settings.rollout_depth > 0:
             self.view = VecEnvView(vec_env, reward_normalizer(agent.get_env(), vec_env, normalize_reward))
             self.environments: Environments = snapshot_environments(self.view.base)
-            self._env_indices = range(len(self.environments))
+            self._all_envs = range(len(self.environments))
             self.model = make_forward_model(self.environments, settings.forward_model, settings.n_threads)
             check_dynamics(settings, self.model.deterministic)
             if settings.strategy == "refine":
@@ -80,29 +82,42 @@ class Searcher:
         """One line that says what simulates."""
         return "none: the critics rank the candidates" if self.model is None else self.model.description
 
-    def search(self, observations: Observations, rng: np.random.Generator) -> SearchResult:
-        """Choose an action for every environment.
+    def search(
+        self,
+        observations: Observations,
+        rng: np.random.Generator,
+        envs: Sequence[int] | None = None,
+        effort: SearchSettings | None = None,
+    ) -> SearchResult:
+        """Choose an action for every environment, or for some.
 
         :param observations: ``[n_envs, *]``, the environments' present observations as the agent got them.
         :param rng: the search's own generator.
-        :return: actions, and what the search found.
+        :param envs: which environments, rising; nothing is read of the others, or simulated for them.
+            ``None``: all.
+        :param effort: the settings with another width or depth, if they are not to be those of always.
+        :return: actions, and what the search found, a row for each of ``envs``.
         :raises ValueError: if the observations are not those of the environments' present states.
         :raises NonFiniteError: if the networks, or the observations, are not finite.
         """
         start = self._pace.clock()
         if self.agent.policy.training:
             self.agent.policy.set_training_mode(False)
+        if envs is not None:
+            observations = take_rows(observations, np.asarray(envs))
         roots: list[Any] = []
         if self.model is not None:
-            roots = self._read_roots()
-            observations = self._present_observations(observations)
-        agent, settings = self.agent_functions(), self.settings
+            envs = self._all_envs if envs is None else envs
+            roots = self._read_roots(envs)
+            observations = self._present_observations(observations, envs)
+        agent, settings = self.agent_functions(), effort or self.settings
         with one_thread(), matmul_precision(settings.matmul_precision):
             if settings.time_budget is None:
                 shape = (_n_rows(observations), self._act_dim)
                 decision = Decision(self.model, roots, observations, agent, settings, shape, rng)
                 if self._plans is not None:
-                    decision = decision._replace(memory=self._plans, moments=self._moments())
+                    assert envs is not None
+                    decision = decision._replace(memory=self._plans, envs=envs, moments=self._moments(envs))
                 result = search(decision)
             else:
                 assert self.model is not None
@@ -117,6 +132,7 @@ class Searcher:
     def model_error(
         self,
         result: SearchResult,
+        envs: Sequence[int],
         observations: Observations,
         rewards: np.ndarray,
         infos: list[dict[str, Any]],
@@ -127,6 +143,7 @@ class Searcher:
         deterministic after all: the forward model is refreshed, then replaced, then told so.
 
         :param result: the decision whose actions were executed.
+        :param envs: the environments that were searched.
         :param observations: ``[n_envs, *]``, what the agent received next.
         :param rewards: ``[n_envs]``, of the environments, not normalised.
         :param infos: one per environment; where an episode ended the last observation is in it.
@@ -137,14 +154,15 @@ class Searcher:
             return None
         predicted = self.view.observe(result.first_step.observations)
         error = 0.0
-        for env in np.flatnonzero(result.chosen >= 0).tolist():
+        for row in np.flatnonzero(result.chosen >= 0).tolist():
+            env = envs[row]
             real = infos[env].get("terminal_observation")
             if real is None:
                 real = _row(observations, env)
-            error = max(error, _difference(_row(predicted, env), real))
+            error = max(error, _difference(_row(predicted, row), real))
             # A vectorized environment hands rewards on as float32.
             error = max(
-                error, _difference(np.float32(result.first_step.rewards[env]), np.float32(rewards[env]))
+                error, _difference(np.float32(result.first_step.rewards[row]), np.float32(rewards[env]))
             )
         if error > 0:
             self._follow_environment(f"The forward model's prediction differs from reality by {error:.3g}. ")
@@ -159,7 +177,7 @@ class Searcher:
             "kind": None if model is None else model.kind,
             "deterministic": None if model is None else model.deterministic,
             "previous_step_differed": self._previous_step_differed,
-            "plans": None if self._plans is None else self._plans.state(self._moments()),
+            "plans": None if self._plans is None else self._plans.state(self._moments(self._all_envs)),
         }
 
     @memory.setter
@@ -168,7 +186,7 @@ class Searcher:
         if self.model is None:
             return
         if self._plans is not None and memory.get("plans") is not None:
-            self._plans.set_state(memory["plans"], self._moments())
+            self._plans.set_state(memory["plans"], self._moments(self._all_envs))
         if self.model.kind != memory["kind"]:
             self.model.close()
             self.model = make_forward_model(self.environments, memory["kind"], self.settings.n_threads)
@@ -213,12 +231,12 @@ class Searcher:
         unscaled += self._low
         return unscaled
 
-    def _present_observations(self, observations: Observations) -> Observations:
+    def _present_observations(self, observations: Observations, envs: Sequence[int]) -> Observations:
         """The environments' own observations, checked against those that the agent was given."""
-        present = self.environments.apply(self._env_indices, _last_observation)
-        for index, observation in enumerate(present):
+        present = self.environments.apply(envs, _last_observation)
+        for row, observation in enumerate(present):
             if observation is None:
-                present[index] = self.view.buffered_observation(index)
+                present[row] = self.view.buffered_observation(envs[row])
         if any(observation is None for observation in present):
             raise ValueError("Reset the vectorized environment before the first search.")
         stacked = stack(present)
@@ -231,16 +249,16 @@ class Searcher:
             )
         return stacked
 
-    def _moments(self) -> list[Moment]:
-        return self.environments.apply(self._env_indices, _moment)
+    def _moments(self, envs: Sequence[int]) -> list[Moment]:
+        return self.environments.apply(envs, _moment)
 
-    def _read_roots(self) -> list[Any]:
+    def _read_roots(self, envs: Sequence[int]) -> list[Any]:
         assert self.model is not None
         try:
-            return self.model.read_roots(self._env_indices)
+            return self.model.read_roots(envs)
         except ForwardModelError as reason:  # the environment exchanged its simulator
             self._follow_environment(f"{reason} ")
-            return self.model.read_roots(self._env_indices)
+            return self.model.read_roots(envs)
 
     def _follow_environment(self, message: str) -> None:
         """Make the forward model what the environments are now.

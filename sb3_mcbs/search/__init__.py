@@ -5,6 +5,7 @@ from sb3_mcbs.search.deadline import Pace, deadline_search
 from sb3_mcbs.search.interface import Agent, FirstStep, SearchResult
 from sb3_mcbs.search.memory import Moment, PlanMemory
 from sb3_mcbs.search.proposals import Noise, draw_noise
+from sb3_mcbs.search.schedule import ScheduleSettings, SearchSchedule
 from sb3_mcbs.search.settings import PRESETS, SearchSettings
 from sb3_mcbs.search.strategies import Decision, check_dynamics, search
 
@@ -17,7 +18,9 @@ __all__ = [
     "Noise",
     "Pace",
     "PlanMemory",
+    "ScheduleSettings",
     "SearchResult",
+    "SearchSchedule",
     "SearchSettings",
     "beam_search",
     "check_dynamics",

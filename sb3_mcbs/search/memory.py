@@ -24,37 +24,37 @@ class PlanMemory:
         self._plans = np.zeros((n_envs, rollout_depth, act_dim), dtype=np.float32)
         self._moments: list[Moment | None] = [None] * n_envs
 
-    def recall(self, now: Sequence[Moment]) -> np.ndarray:
+    def recall(self, envs: Sequence[int], now: Sequence[Moment]) -> np.ndarray:
         """Shift the plans by the steps since their decisions.
 
-        :param now: the present moment of every environment.
-        :return: ``[n_envs, rollout_depth, act_dim]``; 0, the policy's own action, where nothing is left.
+        :param envs: the environments that decide.
+        :param now: the present moment of each.
+        :return: ``[len(envs), rollout_depth, act_dim]``; 0, the policy's own action, where nothing is left.
         """
-        recalled = np.zeros_like(self._plans)
-        depth = recalled.shape[1]
-        for env, age in enumerate(self.ages(now)):
+        depth = self._plans.shape[1]
+        recalled = np.zeros((len(envs), *self._plans.shape[1:]), dtype=self._plans.dtype)
+        for row, (env, age) in enumerate(zip(envs, self._ages(envs, now), strict=True)):
             if 0 <= age < depth:
-                recalled[env, : depth - age] = self._plans[env, age:]
+                recalled[row, : depth - age] = self._plans[env, age:]
         return recalled
 
-    def keep(self, plans: np.ndarray, now: Sequence[Moment]) -> None:
+    def keep(self, plans: np.ndarray, envs: Sequence[int], now: Sequence[Moment]) -> None:
         """Remember the plans of a decision.
 
-        :param plans: ``[n_envs, rollout_depth, act_dim]``.
-        :param now: the present moment of every environment.
+        :param plans: ``[len(envs), rollout_depth, act_dim]``.
+        :param envs: the environments that decided.
+        :param now: the present moment of each.
         """
-        self._plans[:] = plans
-        self._moments = list(now)
+        for plan, env, moment in zip(plans, envs, now, strict=True):
+            self._plans[env] = plan
+            self._moments[env] = moment
 
-    def ages(self, now: Sequence[Moment]) -> list[int]:
-        """Steps since the decisions.
-
-        :param now: the present moment of every environment.
-        :return: one number per environment; -1 where there is no plan for this episode.
-        """
+    def _ages(self, envs: Sequence[int], now: Sequence[Moment]) -> list[int]:
+        """Steps since the decisions; -1 where there is no plan for this episode."""
+        thens = [self._moments[env] for env in envs]
         return [
             present[1] - then[1] if then is not None and then[0] == present[0] else -1
-            for then, present in zip(self._moments, now, strict=True)
+            for then, present in zip(thens, now, strict=True)
         ]
 
     def state(self, now: Sequence[Moment]) -> dict[str, Any]:
@@ -63,7 +63,7 @@ class PlanMemory:
         :param now: the present moment of every environment.
         :return: the plans, and their ages.
         """
-        return {"plans": self._plans.copy(), "ages": self.ages(now)}
+        return {"plans": self._plans.copy(), "ages": self._ages(range(len(now)), now)}
 
     def set_state(self, state: dict[str, Any], now: Sequence[Moment]) -> None:
         """Remember what another memory did.

@@ -2,11 +2,11 @@
 
 import math
 import sys
-from dataclasses import dataclass, fields
-from numbers import Integral, Real
+from dataclasses import dataclass
 from typing import Any
 
 from sb3_mcbs.models.factory import KINDS
+from sb3_mcbs.search.checks import CheckedSettings
 
 #: More rollouts than this per environment are a mistake, not a search: memory would run out.
 MAX_ROLLOUTS = 100_000
@@ -21,7 +21,7 @@ STRATEGIES = ("beam", "tree", "refine")
 
 
 @dataclass(frozen=True)
-class SearchSettings:
+class SearchSettings(CheckedSettings):
     """Settings of a search: Monte Carlo Beam Search (Algorithm 1) unless ``strategy`` says otherwise.
 
     :param beam_width: number of candidate actions per decision (``B``).
@@ -103,8 +103,7 @@ class SearchSettings:
         if self.n_elites is not None:
             self._set_integer("n_elites", 1, self.beam_width)
         for name in ("include_policy_action", "common_noise", "antithetic", "one_node_per_root"):
-            if not isinstance(getattr(self, name), bool):
-                raise TypeError(f"{name} must be True or False, got {getattr(self, name)!r}.")
+            self._check_flag(name)
         self._check_name("forward_model", KINDS)
         self._check_name("strategy", STRATEGIES)
         if self.matmul_precision is not None:
@@ -115,13 +114,6 @@ class SearchSettings:
         self._check_common_noise()
         self._check_budget()
         self._check_size()
-
-    def _check_name(self, setting: str, known: tuple[str, ...], *others: str) -> None:
-        value = getattr(self, setting)
-        # Names are compared as strings only: an array, say, has no answer to whether it is in a tuple.
-        if not isinstance(value, str) or value not in known:
-            allowed = " or ".join([str(known), *others])
-            raise ValueError(f"{setting} must be one of {allowed}, got {value!r}.")
 
     def _check_size(self) -> None:
         factors = ["beam_width", "n_simulations"]
@@ -220,28 +212,6 @@ class SearchSettings:
     def _is_noisy(self, spread: float) -> bool:
         return spread > 0 and self.noise_clip != 0
 
-    def _set_integer(self, name: str, low: int, high: int) -> None:
-        value = getattr(self, name)
-        if isinstance(value, bool) or not isinstance(value, Integral):
-            raise TypeError(f"{name} must be an integer, got {value!r}.")
-        if not low <= int(value) <= high:
-            raise ValueError(f"{name} must be between {low} and {high}, got {value}.")
-        # NumPy's integers have few bits, and products of settings overflow.
-        object.__setattr__(self, name, int(value))
-
-    def _set_number(self, name: str, high: float) -> None:
-        value = getattr(self, name)
-        if isinstance(value, bool) or not isinstance(value, Real):
-            raise TypeError(f"{name} must be a number, got {value!r}.")
-        try:
-            number = float(value)
-        except OverflowError:
-            number = math.inf
-        # NaN is not between anything.
-        if not 0 <= number <= high:
-            raise ValueError(f"{name} must be finite, not negative and at most {high:g}, got {value}.")
-        object.__setattr__(self, name, number)
-
     @property
     def effective_rollout_noise(self) -> float:
         """Standard deviation of the noise on the later actions of a rollout."""
@@ -289,25 +259,6 @@ class SearchSettings:
         if not isinstance(name, str) or name not in PRESETS:
             raise ValueError(f"There is no preset {name!r}; known are {', '.join(PRESETS)}.")
         return cls(**{**PRESETS[name], **changes})
-
-    @classmethod
-    def names(cls) -> tuple[str, ...]:
-        """Names of all settings, in the order of the constructor."""
-        return tuple(field.name for field in fields(cls))
-
-    @classmethod
-    def of(cls, agent: Any) -> "SearchSettings":
-        """Read the settings that an agent carries as attributes.
-
-        :param agent: an object that has settings as attributes, such as ``MCBSTD3``; those that it lacks have
-            their defaults.
-        :return: the checked settings.
-        """
-        # An agent that was saved before a setting existed searches as if it had its default.
-        values: dict[str, Any] = {
-            field.name: getattr(agent, field.name, field.default) for field in fields(cls)
-        }
-        return cls(**values)
 
 
 #: The settings that presets change, by the names of the presets. Around trained agents in deterministic

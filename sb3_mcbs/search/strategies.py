@@ -29,7 +29,8 @@ class Decision(NamedTuple):
     :param shape: ``(n_envs, act_dim)``.
     :param rng: of the search: draws all noise, and is given to a model with random dynamics.
     :param memory: of the strategy ``"refine"``.
-    :param moments: the present moment of every environment, for the memory.
+    :param envs: the environments that decide, by their numbers in the memory.
+    :param moments: the present moment of each, for the memory.
     """
 
     model: ForwardModel | None
@@ -40,6 +41,7 @@ class Decision(NamedTuple):
     shape: tuple[int, int]
     rng: np.random.Generator
     memory: PlanMemory | None = None
+    envs: Sequence[int] = ()
     moments: Sequence[Moment] = ()
 
 
@@ -96,9 +98,9 @@ def _refine(decision: Decision) -> SearchResult:
     assert decision.model is not None, "a refinement needs a forward model"
     assert decision.memory is not None, "a refinement remembers its plans"
     noise = draw_plan_noise(decision.rng, decision.settings, *decision.shape)
-    remembered = decision.memory.recall(decision.moments)
+    remembered = decision.memory.recall(decision.envs, decision.moments)
     result, plans = refine_search(decision.model, *decision[1:5], noise, decision.rng, remembered)
-    decision.memory.keep(plans, decision.moments)
+    decision.memory.keep(plans, decision.envs, decision.moments)
     return result
 
 

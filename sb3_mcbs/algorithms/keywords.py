@@ -1,0 +1,118 @@
+"""The settings of the search and of its schedule as parameters of constructors."""
+
+import inspect
+from dataclasses import Field, fields
+from typing import Any, TypedDict
+
+from sb3_mcbs.search import ScheduleSettings, SearchSettings
+from sb3_mcbs.search.checks import CheckedSettings
+
+#: What an agent's constructor takes besides SB3's parameters, as attributes of the same names.
+SETTINGS: tuple[type[CheckedSettings], ...] = (SearchSettings, ScheduleSettings)
+
+_SEARCH_SETTINGS = "search_settings"
+
+
+class SearchKeywords(TypedDict, total=False):
+    """The fields of :data:`SETTINGS` as keyword arguments, for type checkers."""
+
+    beam_width: int
+    rollout_depth: int
+    n_simulations: int
+    beam_noise: float
+    rollout_noise: float | None
+    noise_clip: float | None
+    include_policy_action: bool
+    n_threads: int
+    forward_model: str
+    matmul_precision: str | None
+    time_budget: float | None
+    max_beam_width: int | None
+    strategy: str
+    n_proposals: int | None
+    common_noise: bool
+    antithetic: bool
+    branching: int
+    one_node_per_root: bool
+    n_rounds: int
+    n_elites: int | None
+    min_noise: float
+    search_schedule: str
+    search_share: float
+    search_unit: str
+    final_search_share: float | None
+    final_beam_width: int | None
+    final_rollout_depth: int | None
+    saturation_window: int
+    saturation_tolerance: float
+    recovery_tolerance: float
+
+
+class SearchAttributes:
+    """The fields of :data:`SETTINGS` as attributes of an agent, for type checkers."""
+
+    beam_width: int
+    rollout_depth: int
+    n_simulations: int
+    beam_noise: float
+    rollout_noise: float | None
+    noise_clip: float | None
+    include_policy_action: bool
+    n_threads: int
+    forward_model: str
+    matmul_precision: str | None
+    time_budget: float | None
+    max_beam_width: int | None
+    strategy: str
+    n_proposals: int | None
+    common_noise: bool
+    antithetic: bool
+    branching: int
+    one_node_per_root: bool
+    n_rounds: int
+    n_elites: int | None
+    min_noise: float
+    search_schedule: str
+    search_share: float
+    search_unit: str
+    final_search_share: float | None
+    final_beam_width: int | None
+    final_rollout_depth: int | None
+    saturation_window: int
+    saturation_tolerance: float
+    recovery_tolerance: float
+
+
+def list_search_settings(cls: type) -> None:
+    """Put the search settings one by one where the constructor has them as ``**search_settings``.
+
+    ``help``, :mod:`inspect` and exact checkpoints then see them like SB3's own parameters.
+
+    :param cls: changed in place; nothing is done for a class without that parameter.
+    """
+    init: Any = cls.__dict__.get("__init__")
+    signature = None if init is None else inspect.signature(init)
+    if signature is None or _SEARCH_SETTINGS not in signature.parameters:
+        return
+    listed = [
+        inspect.Parameter(
+            field.name, inspect.Parameter.KEYWORD_ONLY, default=field.default, annotation=field.type
+        )
+        for field in setting_fields()
+    ]
+    *others, _ = signature.parameters.values()
+    init.__signature__ = signature.replace(parameters=[*others, *listed])
+    if cls.__doc__:  # there is none under ``python -OO``
+        before, _, _ = inspect.cleandoc(cls.__doc__).partition(f":param {_SEARCH_SETTINGS}:")
+        cls.__doc__ = before + "".join(_parameters_documented(settings) for settings in SETTINGS)
+
+
+def setting_fields() -> list[Field]:
+    """The fields of :data:`SETTINGS`."""
+    return [field for settings in SETTINGS for field in fields(settings)]
+
+
+def _parameters_documented(cls: type) -> str:
+    """The lines of a class's docstring that are about its parameters."""
+    _, first, after = inspect.cleandoc(cls.__doc__ or "").partition(":param ")
+    return first + after.partition(":raises ")[0]

@@ -1,0 +1,130 @@
+"""The paper's reward saturation: whether the return has stopped improving, from comparable episodes.
+
+Searched episodes return more than others, so that searching less lowers the return at once. What is compared
+is therefore alike: episodes that began after the last change of the share, and searched ones with searched
+ones only.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+#: A window with fewer episodes says nothing.
+_LEAST = 2
+_START, _END, _TOTAL, _SEARCHED = range(4)
+
+
+class Episode(NamedTuple):
+    """A finished episode.
+
+    :param start: environment steps when it began.
+    :param end: environment steps when it ended.
+    :param total: its return, of the environment's own rewards.
+    :param searched: which kind it is: searched or not, if whole episodes are; otherwise True.
+    """
+
+    start: int
+    end: int
+    total: float
+    searched: bool
+
+
+class Saturation:
+    """Decides between the full and the reduced share of searched decisions.
+
+    Windows end at the present step. With the full share it compares the last one with the one before; with
+    the reduced share it compares the last one with the best since the change. Differences are measured in
+    parts of all that was gained since the training began, whatever the scale of rewards is.
+
+    :ivar is_reduced: whether the share is the reduced one.
+    :ivar changes: how often that has changed.
+    """
+
+    def __init__(self) -> None:
+        self.is_reduced = False
+        self.changes = 0
+        self._since: int | None = None
+        #: ``[n, 4]``, as :class:`Episode`: those of the last two windows.
+        self._episodes = np.zeros((0, 4))
+        self._baseline: float | None = None
+        self._gain = 0.0
+        self._best: dict[bool, float] = {}
+
+    def begin(self, step: int) -> None:
+        """Episodes that begin from now on are searched as the share says.
+
+        :param step: environment steps so far; only the first call counts.
+        """
+        if self._since is None:
+            self._since = step
+
+    def update(
+        self, finished: Sequence[Episode], window: int, tolerance: float, recovery: float, step: int
+    ) -> None:
+        """Learn from finished episodes, and change the share if it is time to.
+
+        :param finished: episodes that ended at this step.
+        :param window: environment steps.
+        :param tolerance: part of the gain by which windows of a saturated return may differ.
+        :param recovery: part of the gain below the best at which the return has fallen.
+        :param step: environment steps so far.
+        """
+        kept = self._episodes[self._episodes[:, _END] > step - 2 * window]
+        self._episodes = np.concatenate([kept, np.array(finished, dtype=float).reshape(-1, 4)])
+        if self._baseline is None and step >= window and len(self._episodes) >= _LEAST:
+            self._baseline = float(self._episodes[:, _TOTAL].mean())
+        if self._since is None or self._baseline is None or step - self._since < window:
+            return
+        comparable = self._episodes[self._episodes[:, _START] >= self._since]
+        is_last = comparable[:, _END] > step - window
+        last, before = comparable[is_last], comparable[~is_last]
+        if len(last) < _LEAST:
+            return
+        rise = float(last[:, _TOTAL].mean()) - self._baseline
+        self._gain = max(self._gain, rise)
+        settled = step - self._since >= 2 * window
+        if self.is_reduced:
+            change = _difference(last, self._best)
+            if settled and change is not None and change < -recovery * self._gain:
+                self._change(step)
+                return
+            for kind, mean in _means(last).items():
+                self._best[kind] = max(mean, self._best.get(kind, mean))
+        elif settled:
+            change = _difference(last, _means(before))
+            # A return that has never risen above its own noise is not saturated: it has yet to improve.
+            has_risen = rise > float(last[:, _TOTAL].std())
+            if has_risen and change is not None and abs(change) <= tolerance * self._gain:
+                self._change(step)
+
+    def _change(self, step: int) -> None:
+        self.is_reduced = not self.is_reduced
+        self.changes += 1
+        self._since = step
+        self._best = {}
+
+
+def _means(episodes: np.ndarray) -> dict[bool, float]:
+    """The mean return of each kind of episode, if there are enough of it.
+
+    :param episodes: ``[n, 4]``, as :class:`Episode`.
+    """
+    by_kind = {kind: episodes[episodes[:, _SEARCHED] == kind, _TOTAL] for kind in (False, True)}
+    return {kind: float(totals.mean()) for kind, totals in by_kind.items() if len(totals) >= _LEAST}
+
+
+def _difference(episodes: np.ndarray, reference: dict[bool, float]) -> float | None:
+    """How much more the episodes return than those of a reference, kind by kind.
+
+    :param episodes: ``[n, 4]``, as :class:`Episode`.
+    :param reference: mean returns by kind.
+    :return: ``None`` if they have no kind in common.
+    """
+    differences = {
+        kind: mean - reference[kind] for kind, mean in _means(episodes).items() if kind in reference
+    }
+    if not differences:
+        return None
+    weights = [np.count_nonzero(episodes[:, _SEARCHED] == kind) for kind in differences]
+    return float(np.average(list(differences.values()), weights=weights))
