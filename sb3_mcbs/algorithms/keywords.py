@@ -4,11 +4,12 @@ import inspect
 from dataclasses import Field, fields
 from typing import Any, TypedDict
 
+from sb3_mcbs.algorithms.rollout_replay import RolloutReplaySettings
 from sb3_mcbs.search import ScheduleSettings, SearchSettings
 from sb3_mcbs.search.checks import CheckedSettings
 
 #: What an agent's constructor takes besides SB3's parameters, as attributes of the same names.
-SETTINGS: tuple[type[CheckedSettings], ...] = (SearchSettings, ScheduleSettings)
+SETTINGS: tuple[type[CheckedSettings], ...] = (SearchSettings, ScheduleSettings, RolloutReplaySettings)
 
 _SEARCH_SETTINGS = "search_settings"
 
@@ -46,6 +47,7 @@ class SearchKeywords(TypedDict, total=False):
     saturation_window: int
     saturation_tolerance: float
     recovery_tolerance: float
+    rollout_replay: float
 
 
 class SearchAttributes:
@@ -81,6 +83,7 @@ class SearchAttributes:
     saturation_window: int
     saturation_tolerance: float
     recovery_tolerance: float
+    rollout_replay: float
 
 
 def list_search_settings(cls: type) -> None:

@@ -1,21 +1,19 @@
 """What makes an off-policy agent look ahead before it acts, whatever it learns by."""
 
-import logging
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, TypeVar
 
 import numpy as np
-from sb3_contrib import TQC
-from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.noise import ActionNoise, NormalActionNoise
+from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
+from sb3_mcbs.algorithms.exploration import DrawnNoise, explore_without_search
 from sb3_mcbs.algorithms.faults import (
     CheckedVecEnv,
     check_observations,
@@ -25,11 +23,10 @@ from sb3_mcbs.algorithms.faults import (
     warn_of_divergence,
 )
 from sb3_mcbs.algorithms.keywords import SearchAttributes, list_search_settings, setting_fields
+from sb3_mcbs.algorithms.rollout_replay import RolloutReplay, RolloutReplaySettings, mixed_batches
 from sb3_mcbs.algorithms.searcher import Searcher
 from sb3_mcbs.algorithms.torch_settings import matmul_precision
-from sb3_mcbs.search import ScheduleSettings, SearchResult, SearchSchedule, SearchSettings
-
-logger = logging.getLogger("sb3_mcbs")
+from sb3_mcbs.search import Rollouts, ScheduleSettings, SearchResult, SearchSchedule, SearchSettings
 
 SelfMCBS = TypeVar("SelfMCBS", bound="MCBS")
 
@@ -82,8 +79,10 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         self.n_critic_evaluations = 0
         self.n_diverged_steps = 0
         self._searcher: Searcher | None = None
-        self._decision: SearchResult | None = None
-        self._searched: Sequence[int] = ()
+        #: What was executed, chosen -1 where it was not, and the environments that were searched.
+        self._decision: tuple[SearchResult, Sequence[int]] | None = None
+        self._rollouts: Rollouts | None = None
+        self.rollout_rng: np.random.Generator | None = None
         self._checked_env: CheckedVecEnv | None = None
 
     @property
@@ -100,6 +99,7 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         # ``load`` sets attributes without calling the constructor, so settings are checked here.
         settings, schedule = self.search_settings, self.schedule_settings
         schedule.check_search(settings)
+        RolloutReplaySettings.of(self).check_search(settings)
         if not isinstance(self.action_noise_after_search, bool):
             raise TypeError(
                 f"action_noise_after_search must be True or False, got {self.action_noise_after_search!r}."
@@ -110,8 +110,20 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         if self._schedule is None:
             self._schedule = SearchSchedule(schedule, self.seed)
         self._schedule.settings = schedule
+        if self.rollout_replay:
+            RolloutReplay(self.replay_buffer, *schedule.most_rollouts(settings))  # makes room in it
+        if self.rollout_rng is None:
+            self.rollout_rng = np.random.default_rng(self.seed)
         if self.env is not None:
             self._make_searcher(self.env, settings)
+
+    def _rollout_store(self) -> RolloutReplay | None:
+        """The rollouts beside the replay buffer, if the agent learns from them."""
+        if not self.rollout_replay:
+            return None
+        assert self.replay_buffer is not None and self._schedule is not None and self._searcher is not None
+        size = self._schedule.settings.most_rollouts(self._searcher.settings)
+        return RolloutReplay(self.replay_buffer, *size)
 
     def _make_searcher(self, env: VecEnv, settings: SearchSettings) -> None:
         if self._searcher is not None:
@@ -134,6 +146,7 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
             self.search_rng = np.random.default_rng(seed)
             if self._schedule is not None:
                 self._schedule.rng = np.random.default_rng(seed)
+            self.rollout_rng = np.random.default_rng(seed)
 
     def _sample_action(
         self,
@@ -151,48 +164,54 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         :return: actions ``[n_envs, *act_shape]`` to take in the environment
             and scaled actions that will be stored in the replay buffer.
         """
-        self._decision = None
+        self._decision = self._rollouts = None
         # For all environments whatever is searched, so that random streams do not depend on the schedule.
-        noise = None if action_noise is None else _DrawnNoise(action_noise)
+        noise = None if action_noise is None else DrawnNoise(action_noise)
         actions, scaled_actions = super()._sample_action(learning_starts, noise, n_envs)
-        self._searched = self._draw_searched(learning_starts)
-        if not self._searched:
+        if self.num_timesteps < learning_starts:
+            return actions, scaled_actions
+        assert self._schedule is not None
+        self.logger.record("search/frequency", self._schedule.share(self._progress))
+        executed = self._schedule.draw(self._progress, self.num_timesteps)
+        # Rollouts to learn from are wanted everywhere.
+        searched = np.flatnonzero(executed | (self.rollout_replay > 0)).tolist()
+        if not searched:
             return actions, scaled_actions
 
+        result = self._search(searched)
+        found = result.actions.reshape(-1, *(self.action_space.shape or ()))
+        if self.action_noise_after_search and noise is not None:
+            drawn = np.broadcast_to(noise.last, scaled_actions.shape)[searched]
+            found = np.clip(found + drawn, -1, 1).astype(found.dtype)
+        else:
+            chosen = np.where(executed[searched], result.chosen, -1)
+            self._decision = result._replace(chosen=chosen), searched
+        if executed.all():
+            return self.policy.unscale_action(found), found
+        # Of one kind, so that searched actions reach the environments as they were simulated.
+        actions, scaled_actions = actions.astype(found.dtype), scaled_actions.astype(found.dtype)
+        found = found[executed[searched]]
+        actions[executed] = self.policy.unscale_action(found)
+        scaled_actions[executed] = found
+        return actions, scaled_actions
+
+    def _search(self, envs: Sequence[int]) -> SearchResult:
+        """Search in some environments, and keep their rollouts if they are learned from."""
         assert self._last_obs is not None, "self._last_obs was not set"
         assert self._searcher is not None and self.search_rng is not None, "learn() needs an environment"
         assert self._schedule is not None
         effort = self._schedule.effort(self._searcher.settings, self._progress)
+        record = self.rollout_replay > 0
         start = time.perf_counter()
-        result = self._searcher.search(self._last_obs, self.search_rng, self._searched, effort)
+        result = self._searcher.search(self._last_obs, self.search_rng, envs, effort, record)
         self._record_decision(result, time.perf_counter() - start, effort)
-
-        found = result.actions.reshape(-1, *(self.action_space.shape or ()))
-        if self.action_noise_after_search and noise is not None:
-            drawn = np.broadcast_to(noise.last, scaled_actions.shape)[self._searched]
-            found = np.clip(found + drawn, -1, 1).astype(found.dtype)
-        else:
-            self._decision = result
-        if len(self._searched) == n_envs:
-            return self.policy.unscale_action(found), found
-        # Of one kind, so that searched actions reach the environments as they were simulated.
-        actions, scaled_actions = actions.astype(found.dtype), scaled_actions.astype(found.dtype)
-        actions[self._searched] = self.policy.unscale_action(found)
-        scaled_actions[self._searched] = found
-        return actions, scaled_actions
+        self._rollouts = result.rollouts
+        return result
 
     @property
     def _progress(self) -> float:
         """How much of the training is done, from 0 to 1."""
         return 1.0 - self._current_progress_remaining
-
-    def _draw_searched(self, learning_starts: int) -> Sequence[int]:
-        """Which environments are searched now."""
-        if self.num_timesteps < learning_starts:
-            return ()
-        assert self._schedule is not None
-        self.logger.record("search/frequency", self._schedule.share(self._progress))
-        return np.flatnonzero(self._schedule.draw(self._progress, self.num_timesteps)).tolist()
 
     def _store_transition(
         self,
@@ -217,9 +236,13 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
             return
         if self._decision is not None:
             assert self._searcher is not None
-            error = self._searcher.model_error(self._decision, self._searched, new_obs, raw_reward, infos)
+            error = self._searcher.model_error(*self._decision, new_obs, raw_reward, infos)
             if error is not None:
                 self.logger.record_mean("search/model_error", error)
+        rollout_store = self._rollout_store()
+        if rollout_store is not None:
+            rollout_store.put(replay_buffer.pos, self._rollouts)
+            self.logger.record("search/stored_rollouts", rollout_store.count)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
     def collect_rollouts(self, env: VecEnv, *args: Any, **kwargs: Any) -> RolloutReturn:
@@ -235,7 +258,8 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         *args: Any,
         **kwargs: Any,
     ) -> tuple[int, BaseCallback]:
-        self._explore_without_search()
+        if not self.schedule_settings.searches_always:
+            explore_without_search(self, self.beam_noise)
         will_reset = reset_num_timesteps or self._last_obs is None
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args, **kwargs)
         check_observations(self._last_obs)
@@ -244,20 +268,6 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
             self._schedule.begin_episodes(self.n_envs, self.num_timesteps)
         return result
 
-    def _explore_without_search(self) -> None:
-        """Give a deterministic actor noise for what is not searched, if it has none."""
-        deterministic = not isinstance(self, SAC | TQC)
-        if self.action_noise is None and deterministic and not self.schedule_settings.searches_always:
-            message = (
-                f"action_noise is None and search_share leaves decisions to the actor: Gaussian noise of "
-                f"beam_noise={self.beam_noise} acts there. Pass an action_noise to choose another."
-            )
-            logger.info(message)
-            if self.verbose >= 1:
-                print(message)
-            n_actions = get_action_dim(self.action_space)
-            self.action_noise = NormalActionNoise(np.zeros(n_actions), np.full(n_actions, self.beam_noise))
-
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
         """
         Update the networks as the agent without search does.
@@ -265,8 +275,15 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         :param gradient_steps: how many gradient steps to do
         :param batch_size: transitions sampled for each
         """
-        with matmul_precision(self.matmul_precision):
+        with matmul_precision(self.matmul_precision), self._learning_from_rollouts():
             super().train(gradient_steps, batch_size)
+
+    def _learning_from_rollouts(self) -> AbstractContextManager[None]:
+        rollout_store = self._rollout_store()
+        if rollout_store is None or rollout_store.count == 0:
+            return nullcontext()
+        assert self.rollout_rng is not None
+        return mixed_batches(self, rollout_store, self.rollout_replay, self.rollout_rng)
 
     def _record_decision(self, result: SearchResult, seconds: float, effort: SearchSettings) -> None:
         n_envs = len(result.chosen)
@@ -357,22 +374,5 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         return super().predict(observation, state, episode_start, deterministic)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_searcher", "_decision", "_checked_env"]
-
-
-class _DrawnNoise(ActionNoise):
-    """Noise that remembers what it drew last.
-
-    :param noise: the noise.
-
-    :ivar last: what it drew last.
-    """
-
-    def __init__(self, noise: ActionNoise) -> None:
-        super().__init__()
-        self._noise = noise
-        self.last = np.zeros(1)
-
-    def __call__(self) -> np.ndarray:
-        self.last = self._noise()
-        return self.last
+        transient = ["_searcher", "_decision", "_rollouts", "_checked_env"]
+        return [*super()._excluded_save_params(), *transient]

@@ -30,7 +30,7 @@ from sb3_mcbs.search import (
     deadline_search,
     search,
 )
-from sb3_mcbs.search.interface import take_rows
+from sb3_mcbs.search.interface import map_arrays, take_rows
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 
 logger = logging.getLogger("sb3_mcbs")
@@ -88,6 +88,7 @@ class Searcher:
         rng: np.random.Generator,
         envs: Sequence[int] | None = None,
         effort: SearchSettings | None = None,
+        record: bool = False,
     ) -> SearchResult:
         """Choose an action for every environment, or for some.
 
@@ -96,6 +97,8 @@ class Searcher:
         :param envs: which environments, rising; nothing is read of the others, or simulated for them.
             ``None``: all.
         :param effort: the settings with another width or depth, if they are not to be those of always.
+        :param record: whether the result shall hold the rollouts, with observations as replay buffers keep
+            them; with the strategy ``"beam"``.
         :return: actions, and what the search found, a row for each of ``envs``.
         :raises ValueError: if the observations are not those of the environments' present states.
         :raises NonFiniteError: if the networks, or the observations, are not finite.
@@ -114,7 +117,9 @@ class Searcher:
         with one_thread(), matmul_precision(settings.matmul_precision):
             if settings.time_budget is None:
                 shape = (_n_rows(observations), self._act_dim)
-                decision = Decision(self.model, roots, observations, agent, settings, shape, rng)
+                decision = Decision(
+                    self.model, roots, observations, agent, settings, shape, rng, record=record
+                )
                 if self._plans is not None:
                     assert envs is not None
                     decision = decision._replace(memory=self._plans, envs=envs, moments=self._moments(envs))
@@ -127,7 +132,17 @@ class Searcher:
                 )
         if result.invalid_rollouts or not is_finite(result.actions):
             _check_networks(agent, observations)
-        return result
+        return self._as_replay_buffers_keep_them(result) if record else result
+
+    def _as_replay_buffers_keep_them(self, result: SearchResult) -> SearchResult:
+        assert result.rollouts is not None
+        rollouts = result.rollouts
+        shape = rollouts.lengths.shape
+        rows = map_arrays(lambda array: array.reshape(-1, *array.shape[2:]), rollouts.observations)
+        observations = map_arrays(
+            lambda array: array.reshape(*shape, *array.shape[1:]), self.view.observe(rows, normalize=False)
+        )
+        return result._replace(rollouts=rollouts._replace(observations=observations))
 
     def model_error(
         self,

@@ -69,16 +69,18 @@ class VecEnvView:
         rows: dict[Any, np.ndarray] = {key: values[index].copy() for key, values in self.base.buf_obs.items()}
         return rows.get(None, rows)
 
-    def observe(self, observations: Observations) -> Observations:
+    def observe(self, observations: Observations, normalize: bool = True) -> Observations:
         """Pass observations of the environments through the wrappers.
 
         :param observations: ``[rows, *obs_shape]`` as the environments return them.
+        :param normalize: False leaves ``VecNormalize`` out, as replay buffers keep them.
         :return: ``[rows, *]`` as the networks expect them.
         """
         observations = _as_space_dtype(observations, self.base.observation_space)
         for layer in self.layers:
             if isinstance(layer, VecNormalize):
-                observations = layer.normalize_obs(observations)
+                if normalize:
+                    observations = layer.normalize_obs(observations)
             elif isinstance(layer, VecTransposeImage):
                 observations = layer.transpose_observations(observations)
             else:

@@ -26,6 +26,7 @@ NOT_STATE: dict[type, dict[str, str]] = {
         "start_time": "the time that was used so far is saved instead",
         "_searcher": "its forward model simulates the environments as they are; what it noticed is saved",
         "_decision": "of the last step; made anew before it is read",
+        "_rollouts": "of the last step; made anew before it is read",
         "_update": "a view of networks, optimizers and replay buffer",
         "_checked_env": "a view of the environment",
         "_resumption": "only there until a run was resumed",

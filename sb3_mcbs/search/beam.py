@@ -9,8 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from sb3_mcbs.models.base import ForwardModel, Observations
-from sb3_mcbs.search.interface import Agent, FirstStep, SearchResult, take_rows
+from sb3_mcbs.models.base import ForwardModel, Observations, Transition
+from sb3_mcbs.search.interface import (
+    Agent,
+    FirstStep,
+    Rollouts,
+    SearchResult,
+    map_arrays,
+    put_rows,
+    take_rows,
+)
 from sb3_mcbs.search.proposals import (
     Noise,
     clip_actions,
@@ -42,6 +50,7 @@ def beam_search(
     settings: SearchSettings,
     noise: Noise,
     rng: np.random.Generator,
+    record: bool = False,
 ) -> SearchResult:
     """Choose one action per environment (Algorithm 1, steps 1 to 3).
 
@@ -52,6 +61,7 @@ def beam_search(
     :param settings: width, depth and simulations.
     :param noise: from :func:`draw_noise`.
     :param rng: given to a model with random dynamics, see :meth:`ForwardModel.set_roots`.
+    :param record: whether the result holds the rollouts, if there are any.
     :return: actions, and what the search found.
     """
     policy_actions = agent.policy(observations)
@@ -64,8 +74,10 @@ def beam_search(
         values = critic_values(observations, candidates, agent)[..., None]
         return choose(policy_actions, candidates, values, None, 0)
     assert model is not None, "a rollout needs a forward model"
-    rollouts = rollout_values(model, roots, candidates, agent, settings, noise, rng)
-    return choose(policy_actions, candidates, *rollouts)
+    recorder = RolloutRecorder(settings.rollout_depth) if record else None
+    evaluated = rollout_values(model, roots, candidates, agent, settings, noise, rng, recorder=recorder)
+    result = choose(policy_actions, candidates, *evaluated)
+    return result if recorder is None else result._replace(rollouts=recorder.rollouts(candidates))
 
 
 def choose(
@@ -119,6 +131,7 @@ def rollout_values(
     noise: Noise,
     rng: np.random.Generator,
     out_of_time: Callable[[], bool] = lambda: False,
+    recorder: "RolloutRecorder | None" = None,
 ) -> tuple[np.ndarray, FirstStep, int]:
     """Evaluate ShortHorizon for every environment, candidate and simulation (Algorithm 1, step 2).
 
@@ -130,6 +143,7 @@ def rollout_values(
     :param candidates: ``[n_envs, beam, act_dim]``.
     :param noise: of ``beam`` candidates at least.
     :param out_of_time: asked before every step; True gives up.
+    :param recorder: is told every step.
     :return: values ``[n_envs, beam, sim]`` in float64 (NaN where a simulation was invalid), the first step of
         every candidate ``[n_envs * beam]``, and the number of simulated steps.
     :raises OutOfTimeError: if it gave up.
@@ -158,6 +172,8 @@ def rollout_values(
             first_step = FirstStep(
                 take_rows(observations, slice(None, None, n_first)), step.rewards[::n_first].copy()
             )
+        if recorder is not None:
+            recorder.note_step(step, unfinished, row_of, n_rollouts)
         rewards = agent.scale_reward(step.rewards)
         all_valid = step.valid.all()
         if not all_valid:
@@ -188,6 +204,59 @@ def rollout_values(
                 observations = take_rows(observations, observation_of)
             returns[unfinished] += discount * agent.value(observations, actions).astype(np.float64)
     return returns.reshape(n_envs, beam, n_sim), first_step, simulated_steps
+
+
+class RolloutRecorder:
+    """Keeps what rollouts went through.
+
+    :param rollout_depth: steps of a rollout.
+    """
+
+    def __init__(self, rollout_depth: int) -> None:
+        self._depth_limit = rollout_depth
+        self._depth = 0
+
+    def note_step(
+        self, step: Transition, unfinished: np.ndarray | slice, row_of: np.ndarray | None, n_rollouts: int
+    ) -> None:
+        """Keep a step of all rollouts that go on.
+
+        :param step: ``[rows]``.
+        :param unfinished: which rollouts those are.
+        :param row_of: the row of each; ``None`` if rows are in the order of ``unfinished``.
+        :param n_rollouts: of all environments.
+        """
+        rows = np.arange(len(step.rewards)) if row_of is None else row_of
+        if self._depth == 0:
+            self._rewards = np.zeros((n_rollouts, self._depth_limit))
+            self._lengths = np.zeros(n_rollouts, dtype=int)
+            self._terminated = np.zeros(n_rollouts, dtype=bool)
+            self._observations = take_rows(step.observations, rows)
+        else:
+            put_rows(self._observations, unfinished, step.observations, rows)
+        self._rewards[unfinished, self._depth] = step.rewards[rows]
+        self._lengths[unfinished] = np.where(step.valid[rows], self._depth + 1, 0)
+        self._terminated[unfinished] = step.terminated[rows]
+        self._depth += 1
+
+    def rollouts(self, candidates: np.ndarray) -> Rollouts:
+        """All of them.
+
+        :param candidates: ``[n_envs, beam, act_dim]``, their first actions.
+        """
+        n_envs, beam = candidates.shape[:2]
+        n_sim = len(self._lengths) // (n_envs * beam)
+
+        def by_env(array: np.ndarray) -> np.ndarray:
+            return array.reshape(n_envs, beam * n_sim, *array.shape[1:])
+
+        return Rollouts(
+            np.repeat(candidates, n_sim, axis=1),
+            by_env(self._rewards),
+            by_env(self._lengths),
+            by_env(self._terminated),
+            map_arrays(by_env, self._observations),
+        )
 
 
 def join_rounds(first_steps: list[FirstStep], n_envs: int) -> FirstStep:

@@ -5,7 +5,7 @@ Axes: ``n_envs`` environments, ``beam`` candidates, ``sim`` simulations, ``act_d
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -42,6 +42,24 @@ class FirstStep(NamedTuple):
     rewards: np.ndarray
 
 
+class Rollouts(NamedTuple):
+    """What every rollout of a search by Algorithm 1 went through, before the critics closed it.
+
+    :param actions: ``[n_envs, rollouts, act_dim]``, the first action, scaled; ``rollouts`` are the
+        simulations of the first candidate, those of the second, and so on.
+    :param rewards: ``[n_envs, rollouts, rollout_depth]``, of the environment; 0 after the rollout's end.
+    :param lengths: ``[n_envs, rollouts]``, steps until the end; 0 where the rollout diverged.
+    :param terminated: ``[n_envs, rollouts]``, whether the environment ended it.
+    :param observations: ``[n_envs, rollouts, *obs_shape]``, the last one.
+    """
+
+    actions: np.ndarray
+    rewards: np.ndarray
+    lengths: np.ndarray
+    terminated: np.ndarray
+    observations: Observations
+
+
 class SearchResult(NamedTuple):
     """The outcome of one decision in every environment.
 
@@ -59,6 +77,7 @@ class SearchResult(NamedTuple):
     :param rounds: finished rounds: 1, or any number if the search had a time budget, or ``n_rounds``.
     :param critic_evaluations: observations with an action that the critics rated.
     :param surviving_roots: of a tree: ``[n_envs]``, how many root actions still had a node at the end.
+    :param rollouts: what was simulated, if that was asked for.
     """
 
     actions: np.ndarray
@@ -71,6 +90,19 @@ class SearchResult(NamedTuple):
     rounds: int = 1
     critic_evaluations: int = 0
     surviving_roots: np.ndarray | None = None
+    rollouts: Rollouts | None = None
+
+
+def map_arrays(function: Callable[[np.ndarray], Any], observations: Observations) -> Any:
+    """Apply a function to observations, or to each part of a dict of them.
+
+    :param function: of one array.
+    :param observations: one array, or one per key.
+    :return: its value, or one per key.
+    """
+    if isinstance(observations, dict):
+        return {key: function(value) for key, value in observations.items()}
+    return function(observations)
 
 
 def take_rows(observations: Observations, index: np.ndarray | slice) -> Observations:
@@ -83,3 +115,20 @@ def take_rows(observations: Observations, index: np.ndarray | slice) -> Observat
     if isinstance(observations, dict):
         return {key: value[index].copy() for key, value in observations.items()}
     return observations[index].copy()
+
+
+def put_rows(target: Observations, into: Any, source: Observations, index: Any) -> None:
+    """Copy rows into other observations.
+
+    :param target: ``[n, *obs_shape]``, changed in place.
+    :param into: which of its rows, or other places.
+    :param source: ``[rows, *obs_shape]``.
+    :param index: which of its rows, or other places, as many.
+    """
+    if isinstance(target, dict):
+        assert isinstance(source, dict)
+        for key, value in target.items():
+            value[into] = source[key][index]
+    else:
+        assert isinstance(source, np.ndarray)
+        target[into] = source[index]

@@ -143,6 +143,16 @@ class ScheduleSettings(CheckedSettings):
             if end is not None
         }
 
+    def most_rollouts(self, settings: SearchSettings) -> tuple[int, int]:
+        """How many rollouts a decision of the training has at most, and of how many steps.
+
+        :param settings: where it begins.
+        """
+        return (
+            max(settings.beam_width, self.final_beam_width or 0) * settings.n_simulations,
+            max(settings.rollout_depth, self.final_rollout_depth or 0),
+        )
+
 
 class SearchSchedule:
     """Says at every step which environments are searched, and how wide and deep.

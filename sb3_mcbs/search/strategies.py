@@ -31,6 +31,7 @@ class Decision(NamedTuple):
     :param memory: of the strategy ``"refine"``.
     :param envs: the environments that decide, by their numbers in the memory.
     :param moments: the present moment of each, for the memory.
+    :param record: whether the result shall hold the rollouts; of the strategy ``"beam"``.
     """
 
     model: ForwardModel | None
@@ -43,6 +44,7 @@ class Decision(NamedTuple):
     memory: PlanMemory | None = None
     envs: Sequence[int] = ()
     moments: Sequence[Moment] = ()
+    record: bool = False
 
 
 def search(decision: Decision) -> SearchResult:
@@ -85,7 +87,7 @@ def check_dynamics(settings: SearchSettings, deterministic: bool) -> None:
 
 def _beam(decision: Decision) -> SearchResult:
     noise = draw_noise(decision.rng, decision.settings, *decision.shape)
-    return beam_search(*decision[:5], noise, decision.rng)
+    return beam_search(*decision[:5], noise, decision.rng, decision.record)
 
 
 def _tree(decision: Decision) -> SearchResult:

@@ -1,0 +1,49 @@
+"""How an agent that does not search at every step explores at the others."""
+
+import logging
+
+import numpy as np
+from sb3_contrib import TQC
+from stable_baselines3 import SAC
+from stable_baselines3.common.noise import ActionNoise, NormalActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.preprocessing import get_action_dim
+
+logger = logging.getLogger("sb3_mcbs")
+
+
+def explore_without_search(agent: OffPolicyAlgorithm, noise: float) -> None:
+    """Give a deterministic actor noise for what is not searched, if it has none.
+
+    :param agent: an agent that does not search at every step.
+    :param noise: standard deviation of Gaussian noise, in the action space scaled to [-1, 1].
+    """
+    if agent.action_noise is not None or isinstance(agent, SAC | TQC):
+        return
+    message = (
+        "action_noise is None, and search_share leaves decisions to the actor: Gaussian noise of "
+        f"beam_noise={noise} acts there. Pass an action_noise to choose another."
+    )
+    logger.info(message)
+    if agent.verbose >= 1:
+        print(message)
+    n_actions = get_action_dim(agent.action_space)
+    agent.action_noise = NormalActionNoise(np.zeros(n_actions), np.full(n_actions, noise))
+
+
+class DrawnNoise(ActionNoise):
+    """Noise that remembers what it drew last.
+
+    :param noise: the noise.
+
+    :ivar last: what it drew last.
+    """
+
+    def __init__(self, noise: ActionNoise) -> None:
+        super().__init__()
+        self._noise = noise
+        self.last = np.zeros(1)
+
+    def __call__(self) -> np.ndarray:
+        self.last = self._noise()
+        return self.last
