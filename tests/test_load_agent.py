@@ -145,8 +145,16 @@ def test_lists_what_was_not_taken_over(saved, caplog):
     assert left["policy_class"] == left["lr_schedule"] == "a pickle, which is not opened"
     assert left["tau"] == "not needed to act"
     assert left["action_space"] == "the environment's is used"
-    assert left["actor.optimizer.pth"] == left["pytorch_variables.pth"] == "a member that is not read"
-    assert not left.keys() & {"gamma", "ent_coef", "use_sde", "policy_kwargs", "policy.pth", "data"}
+    assert left["actor.optimizer.pth"] == left["critic.optimizer.pth"] == "a member that is not read"
+    assert not left.keys() & {
+        "gamma",
+        "ent_coef",
+        "use_sde",
+        "policy_kwargs",
+        "policy.pth",
+        "pytorch_variables.pth",
+        "data",
+    }
     assert "lr_schedule" in caplog.text and not [r for r in caplog.records if r.levelname == "WARNING"]
 
 

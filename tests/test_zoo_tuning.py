@@ -10,7 +10,7 @@ import optuna
 import pytest
 
 from sb3_mcbs import SearchPolicy
-from sb3_mcbs.search import SearchSettings
+from sb3_mcbs.search import SearchSettings, with_preset
 from sb3_mcbs.zoo import sampler, train
 from sb3_mcbs.zoo.registration import ALGORITHMS
 from tests.zoo_helpers import TINY, zoo_train
@@ -39,8 +39,8 @@ def sample(params: dict[str, Any], base: str = "td3") -> dict[str, Any]:
 @pytest.mark.parametrize("base", BASES)
 def test_only_the_search_is_tuned_by_default(base: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(sampler.SWITCH, raising=False)
-    assert sample(SEARCH, base) == SEARCH
-    assert sampler.convert_mcbs_params(SEARCH) == SEARCH
+    assert sample(SEARCH, base) == {**SEARCH, "preset": None}
+    assert sampler.convert_mcbs_params(SEARCH) == {**SEARCH, "preset": None}
 
 
 @pytest.mark.parametrize("base", ["td3", "ddpg"])
@@ -77,21 +77,33 @@ def test_everything_is_tuned_of_agents_with_quantiles_or_entropy(
     assert base == "sac" or (agent.critic.n_quantiles, agent.top_quantiles_to_drop_per_net) == (9, 3)
 
 
-def test_strategies_are_tuned_when_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+def search_settings(params: dict[str, Any]) -> SearchSettings:
+    """What a trial searches with, whatever preset the hyperparameter file names."""
+    file = {"preset": "strong"}
+    params = {**file, **params}
+    return SearchSettings(**with_preset(params.pop("preset"), params))
+
+
+@pytest.mark.parametrize("base", BASES)
+def test_strategies_are_tuned_when_asked(base: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(sampler.SWITCH, "strategies")
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
     seen: dict[str, int] = {}
+    values = set()
     for _ in range(400):
         trial = study.ask()
         try:
-            params = sampler.sample_mcbs_params("td3", trial, 1, 1, dict(NO_HER))
+            params = sampler.sample_mcbs_params(base, trial, 1, 1, dict(NO_HER))
         except optuna.TrialPruned:
             assert trial.user_attrs["pruned"]
             continue
-        settings = SearchSettings(**params)
+        settings = search_settings(params)
         assert settings.simulated_steps(deterministic=False) <= sampler.MAX_SIMULATED_STEPS
         assert sampler.convert_mcbs_params(trial.params) == params
         seen[settings.strategy] = seen.get(settings.strategy, 0) + 1
+        values.add((settings.entropy_bonus, settings.tqc_value))
+    assert {bonus for bonus, _ in values} == ({False, True} if base in ("sac", "tqc") else {False})
+    assert {value for _, value in values} == ({"mean", "truncated"} if base == "tqc" else {"mean"})
     assert set(seen) == set(sampler.STRATEGIES) and min(seen.values()) >= 5
 
 
@@ -116,7 +128,7 @@ def test_every_other_combination_is_accepted_by_the_constructor() -> None:
             for n_simulations in sampler.N_SIMULATIONS:
                 params = {"beam_width": width, "rollout_depth": depth, "n_simulations": n_simulations}
                 try:
-                    SearchSettings(**sample({**params, "beam_noise": sampler.BEAM_NOISE[1]}))
+                    search_settings(sample({**params, "beam_noise": sampler.BEAM_NOISE[1]}))
                     accepted += 1
                 except optuna.TrialPruned:
                     assert depth == 0 or width * depth * n_simulations > sampler.MAX_SIMULATED_STEPS

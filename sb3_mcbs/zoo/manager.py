@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_mcbs.checkpoints import CheckpointError, ExactCheckpointCallback
 from sb3_mcbs.checkpoints.resume import continue_with
 from sb3_mcbs.checkpoints.resumption import Resumption
-from sb3_mcbs.search import SearchSettings
+from sb3_mcbs.search import SearchSettings, with_preset
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 from sb3_mcbs.zoo.callbacks import SearchEvalCallback, SecondEvalCallback
 from sb3_mcbs.zoo.paths import hyperparams_path, sibling_folder
@@ -88,6 +88,8 @@ class MCBSExperimentManager(ExperimentManager):
         """
         Read the hyperparameters as RL Zoo does, and accept 0 as a trial's number.
 
+        A preset of the command line goes before what the file says of the search.
+
         :return: the hyperparameters, and the same in order, to be saved
         """
         first_trial = self.trial_id == 0 and self.storage and self.study_name
@@ -95,6 +97,9 @@ class MCBSExperimentManager(ExperimentManager):
             print("Loading from Optuna study...")
             trial = self.load_trial(str(self.storage), str(self.study_name), 0)
             self.custom_hyperparams = {**trial, **(self.custom_hyperparams or {})}
+        custom = self.custom_hyperparams or {}
+        if self.algo in ALGORITHMS and not self.optimize_hyperparameters and "preset" in custom:
+            self.custom_hyperparams = with_preset(custom["preset"], custom)
         return super().read_hyperparameters()
 
     def _preprocess_hyperparams(

@@ -3,7 +3,8 @@ What ``-optimize`` draws for our algorithms, and how a trial's parameters become
 
 By default only the size and noise of the search are tuned and the other settings of the hyperparameter file
 are held, so that trials differ in one thing. ``SB3_MCBS_TUNE=strategies`` tunes how it searches as well,
-``SB3_MCBS_TUNE=all`` what RL Zoo tunes of the algorithm without search.
+``SB3_MCBS_TUNE=all`` what RL Zoo tunes of the algorithm without search. Trials know no ``preset``: one in the
+hyperparameter file would change what a trial does not draw.
 """
 
 import os
@@ -12,6 +13,7 @@ from typing import Any
 import optuna
 
 from sb3_mcbs.search import SearchSettings
+from sb3_mcbs.search.settings import TQC_VALUES
 
 SWITCH = "SB3_MCBS_TUNE"
 SCOPES = ("search", "strategies", "all")
@@ -30,6 +32,8 @@ MAX_SIMULATED_STEPS = 600
 
 #: What trials store of a strategy under names that are no settings themselves.
 _HELPERS = ("proposal_factor", "noise_free_rollouts")
+
+_NO_PRESET: dict[str, Any] = {"preset": None}
 
 
 def tuning_scope() -> str:
@@ -65,7 +69,7 @@ def sample_mcbs_params(
         "beam_noise": trial.suggest_float("beam_noise", *BEAM_NOISE, log=True),
     }
     if scope == "strategies":
-        sampled |= _sample_strategy(trial)
+        sampled |= _sample_strategy(trial, base, sampled["rollout_depth"])
     params = _search_settings(sampled)
     reason = _why_senseless(params, sampled)
     if reason is not None:
@@ -75,10 +79,10 @@ def sample_mcbs_params(
         from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
 
         params.update(HYPERPARAMS_SAMPLER[base](trial, n_actions, n_envs, additional_args))
-    return params
+    return {**params, **_NO_PRESET}
 
 
-def _sample_strategy(trial: optuna.Trial) -> dict[str, Any]:
+def _sample_strategy(trial: optuna.Trial, base: str, rollout_depth: int) -> dict[str, Any]:
     """Draw how to search, by the names that the trial stores."""
     strategy = trial.suggest_categorical("strategy", STRATEGIES)
     sampled: dict[str, Any] = {
@@ -89,11 +93,15 @@ def _sample_strategy(trial: optuna.Trial) -> dict[str, Any]:
     if strategy == "beam":
         for name in ("noise_free_rollouts", "include_policy_action", "common_noise"):
             sampled[name] = trial.suggest_categorical(name, (False, True))
+        if base in ("sac", "tqc") and rollout_depth:
+            sampled["entropy_bonus"] = trial.suggest_categorical("entropy_bonus", (False, True))
     elif strategy == "tree":
         sampled["branching"] = trial.suggest_categorical("branching", BRANCHING)
         sampled["one_node_per_root"] = trial.suggest_categorical("one_node_per_root", (False, True))
     else:
         sampled["n_rounds"] = trial.suggest_categorical("n_rounds", N_ROUNDS)
+    if base == "tqc":
+        sampled["tqc_value"] = trial.suggest_categorical("tqc_value", TQC_VALUES)
     return sampled
 
 
@@ -133,6 +141,7 @@ def convert_mcbs_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     """
     search_names = {*SearchSettings.names(), *_HELPERS}
     search = _search_settings({name: v for name, v in sampled_params.items() if name in search_names})
+    search |= _NO_PRESET
     others = {name: value for name, value in sampled_params.items() if name not in search_names}
     if not others:
         return search
