@@ -244,11 +244,12 @@ def entropy_function(agent: OffPolicyAlgorithm) -> Callable[[Observations, np.nd
             mean, log_std, more = actor.get_action_dist_params(tensor)
             distribution = actor.action_dist.proba_distribution(mean, log_std, **more)
             squashed = th.as_tensor(actions, device=agent.device)
-            # Where tanh is saturated its inverse is a guess; what the policy's own action came from is known.
-            is_own = squashed == th.tanh(distribution.distribution.mean)
-            latent = th.where(is_own, distribution.distribution.mean, TanhBijector.inverse(squashed))
-            log_prob = distribution.distribution.log_prob(latent).sum(dim=1)
-            log_prob -= th.log(1 - squashed**2 + distribution.epsilon).sum(dim=1)
+            if actor.use_sde:
+                log_prob = distribution.log_prob(squashed)
+            else:
+                # Where tanh is saturated its inverse is a guess; that of the policy's own action is known.
+                latent = th.where(squashed == th.tanh(mean), mean, TanhBijector.inverse(squashed))
+                log_prob = distribution.log_prob(squashed, latent)
             return (-entropy_coefficient(agent) * log_prob).cpu().numpy()
 
     return bonus
