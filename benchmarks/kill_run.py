@@ -16,7 +16,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecNormalize
 
 from benchmarks.common import NETWORKS
-from sb3_mcbs import MCBSTD3, SnapshotEnvWrapper
+from sb3_mcbs import MCBSDDPG, MCBSSAC, MCBSTD3, MCBSTQC, SnapshotEnvWrapper
 from sb3_mcbs.checkpoints import ExactCheckpointCallback, resume
 
 
@@ -44,6 +44,9 @@ CASES = {
 }
 ALGORITHMS: dict[str, tuple[type[OffPolicyAlgorithm], dict[str, Any]]] = {
     "mcbs_td3": (MCBSTD3, {"n_threads": 1}),
+    "mcbs_ddpg": (MCBSDDPG, {"n_threads": 1, "rollout_replay": 0.25}),
+    "mcbs_sac": (MCBSSAC, {"n_threads": 1, "use_sde": True, "entropy_bonus": True, "search_share": 0.5}),
+    "mcbs_tqc": (MCBSTQC, {"n_threads": 1, "preset": "balanced", "tqc_value": "truncated"}),
     "td3": (TD3, {}),
     "sac": (SAC, {}),
     "td3_one_rollout": (TD3, {"train_freq": 1_000_000}),
@@ -154,6 +157,8 @@ def ending(agent: OffPolicyAlgorithm, folder: Path) -> dict[str, np.ndarray]:
     for part in ("actor", "critic"):
         for index, state in getattr(agent, part).optimizer.state_dict()["state"].items():
             result |= {f"{part} optimizer {index} {name}": _digest(value) for name, value in state.items()}
+    if getattr(agent, "log_ent_coef", None) is not None:
+        result["logarithm of the entropy coefficient"] = _digest(agent.log_ent_coef.detach())
     assert agent.replay_buffer is not None
     for name, value in vars(agent.replay_buffer).items():
         if isinstance(value, np.ndarray):

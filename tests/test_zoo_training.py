@@ -8,7 +8,7 @@ import torch as th
 import yaml
 from stable_baselines3.common.logger import Logger
 
-from sb3_mcbs import MCBSTD3, SearchPolicy, SnapshotEnvWrapper
+from sb3_mcbs import MCBSTD3, SearchPolicy, SearchSettings, SnapshotEnvWrapper
 from sb3_mcbs.zoo.callbacks import RenamingLogger, SearchEvalCallback, SecondEvalCallback
 from sb3_mcbs.zoo.paths import sibling_folder
 from sb3_mcbs.zoo.registration import ALGORITHMS
@@ -148,6 +148,27 @@ def test_mujoco_lands_on_the_batch(
     words = ("-n", "120", "--eval-freq", "-1", "-params", *TINY_SEARCH)
     zoo_train(monkeypatch, tmp_path, "mcbs_td3", *words, env="HalfCheetah-v5")
     assert "Forward model: MuJoCo batch of HalfCheetahEnv" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_a_preset_of_the_command_line_goes_before_the_file(
+    algo: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = (
+        "-n",
+        "101",
+        "--eval-freq",
+        "-1",
+        "-params",
+        *TINY,
+        "preset:'strong'",
+        "beam_width:8",
+        "n_threads:1",
+    )
+    zoo_train(monkeypatch, tmp_path, algo, *words)
+    agent = ALGORITHMS[algo].load(tmp_path / "logs" / algo / "Pendulum-v1_1" / "Pendulum-v1.zip")
+    settings = SearchSettings.preset("strong", beam_width=8, n_threads=1)
+    assert (agent.preset, agent.search_settings) == ("strong", settings)
 
 
 def test_several_environments_in_this_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

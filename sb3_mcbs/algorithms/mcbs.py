@@ -22,18 +22,11 @@ from sb3_mcbs.algorithms.faults import (
     leave_out_step,
     warn_of_divergence,
 )
-from sb3_mcbs.algorithms.keywords import SearchAttributes, list_search_settings, setting_fields
+from sb3_mcbs.algorithms.keywords import SearchAttributes, complete_settings, list_search_settings
 from sb3_mcbs.algorithms.rollout_replay import RolloutReplay, RolloutReplaySettings, mixed_batches
 from sb3_mcbs.algorithms.searcher import Searcher
 from sb3_mcbs.algorithms.torch_settings import matmul_precision
-from sb3_mcbs.search import (
-    Rollouts,
-    ScheduleSettings,
-    SearchResult,
-    SearchSchedule,
-    SearchSettings,
-    with_preset,
-)
+from sb3_mcbs.search import Rollouts, ScheduleSettings, SearchResult, SearchSchedule, SearchSettings
 
 SelfMCBS = TypeVar("SelfMCBS", bound="MCBS")
 
@@ -71,16 +64,8 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         :raises TypeError: if there is no such setting
         :raises ValueError: if there is no such preset
         """
-        known = {field.name: field.default for field in setting_fields()}
-        unknown = sorted(settings.keys() - known.keys())
-        if unknown:
-            raise TypeError(
-                f"{type(self).__name__} got unexpected keyword arguments {unknown}; the settings of the "
-                f"search are {list(known)}."
-            )
-        settings = with_preset(preset, settings)
-        for name, default in known.items():
-            setattr(self, name, settings.get(name, default))
+        for name, value in complete_settings(type(self).__name__, settings, preset).items():
+            setattr(self, name, value)
         self.preset = self._preset_taken_over = preset
         self.action_noise_after_search = action_noise_after_search
 
@@ -129,6 +114,7 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
             self._schedule = SearchSchedule(schedule, self.seed)
         self._schedule.settings = schedule
         if self.rollout_replay:
+            assert self.replay_buffer is not None
             RolloutReplay(self.replay_buffer, *schedule.most_rollouts(settings))  # makes room in it
         if self.rollout_rng is None:
             self.rollout_rng = np.random.default_rng(self.seed)
@@ -185,7 +171,12 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         self._decision = self._rollouts = None
         # For all environments whatever is searched, so that random streams do not depend on the schedule.
         noise = None if action_noise is None else DrawnNoise(action_noise)
-        actions, scaled_actions = super()._sample_action(learning_starts, noise, n_envs)
+        try:
+            actions, scaled_actions = super()._sample_action(learning_starts, noise, n_envs)
+        except ValueError:  # of torch: a stochastic actor cannot sample where its mean is NaN
+            assert self._searcher is not None and self._last_obs is not None
+            self._searcher.check_networks(self._last_obs)
+            raise
         if self.num_timesteps < learning_starts:
             return actions, scaled_actions
         assert self._schedule is not None
