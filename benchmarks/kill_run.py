@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
+from sb3_contrib import TQC
 from stable_baselines3 import SAC, TD3
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -157,7 +158,7 @@ def ending(agent: OffPolicyAlgorithm, folder: Path) -> dict[str, np.ndarray]:
     for part in ("actor", "critic"):
         for index, state in getattr(agent, part).optimizer.state_dict()["state"].items():
             result |= {f"{part} optimizer {index} {name}": _digest(value) for name, value in state.items()}
-    if getattr(agent, "log_ent_coef", None) is not None:
+    if isinstance(agent, SAC | TQC) and agent.log_ent_coef is not None:
         result["logarithm of the entropy coefficient"] = _digest(agent.log_ent_coef.detach())
     assert agent.replay_buffer is not None
     for name, value in vars(agent.replay_buffer).items():

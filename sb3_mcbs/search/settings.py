@@ -280,6 +280,7 @@ class SearchSettings(CheckedSettings):
         :return: the settings.
         :raises ValueError: if there is no preset of that name.
         """
+        _check_preset(name)
         return cls(**with_preset(name, changes))
 
 
@@ -311,6 +312,10 @@ def with_preset(name: str | None, changes: Mapping[str, Any]) -> dict[str, Any]:
     """
     if name is None:
         return dict(changes)
+    _check_preset(name)
+    return {**PRESETS[name], **changes}
+
+
+def _check_preset(name: object) -> None:
     if not isinstance(name, str) or name not in PRESETS:
         raise ValueError(f"There is no preset {name!r}; known are {', '.join(PRESETS)}.")
-    return {**PRESETS[name], **changes}
