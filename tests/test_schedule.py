@@ -5,12 +5,13 @@ import pytest
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 
-from sb3_mcbs import MCBSSAC, MCBSTD3
+from sb3_mcbs import MCBSSAC, MCBSTD3, MCBSTQC
 from sb3_mcbs.search import ScheduleSettings, SearchSchedule, SearchSettings, draw_noise
 from tests.checkpoint_helpers import assert_resumed_is_exact
 from tests.conftest import SEARCHING, WITHOUT_SEARCH, assert_same_parameters, snapshot_vec_env
 
 EPISODE = 100
+GSDE = dict(use_sde=True, use_sde_at_warmup=True, sde_sample_freq=4)
 WINDOW = 1000
 
 
@@ -145,12 +146,14 @@ def test_settings_without_a_meaning_are_refused(make_agent, settings, search, wo
         make_agent(**settings, **search)
 
 
-@pytest.mark.parametrize("cls", SEARCHING)
-def test_without_searched_steps_an_agent_is_the_one_without_search(make_agent, cls):
+@pytest.mark.parametrize(
+    "cls, settings", [*((cls, {}) for cls in SEARCHING), (MCBSSAC, GSDE), (MCBSTQC, GSDE)]
+)
+def test_without_searched_steps_an_agent_is_the_one_without_search(make_agent, cls, settings):
     noise = OrnsteinUhlenbeckActionNoise(np.zeros(1), 0.3 * np.ones(1))
     agents = [
-        make_agent(snapshot_vec_env("Pendulum-v1", 2), cls=each, action_noise=noise, **settings)
-        for each, settings in (
+        make_agent(snapshot_vec_env("Pendulum-v1", 2), cls=each, action_noise=noise, **settings, **share)
+        for each, share in (
             (cls, dict(search_share=0.0, **(dict(fast_update=False) if "TD3" in cls.__name__ else {}))),
             (WITHOUT_SEARCH[cls], {}),
         )

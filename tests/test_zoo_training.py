@@ -197,6 +197,7 @@ def test_environments_in_worker_processes(tmp_path: Path, monkeypatch: pytest.Mo
         ("mcbs_td3", "{}", "mcbs_td3 is evaluated with its training's search settings already"),
         ("ppo", "{}", "ppo has no policy and critics to search with"),
         ("td3", "{'beam': 3}", "unknown settings: beam. Known are: beam_width"),
+        ("td3", "{'preset': 'quick'}", "There is no preset 'quick'"),
         ("td3", "'6,3,5'", "must be a dictionary of search settings"),
         ("td3", "{'beam_width': 0}", "beam_width must be between 1"),
     ],

@@ -205,6 +205,11 @@ def test_objective_is_the_actor_with_search(tmp_path: Path, monkeypatch: pytest.
     assert config["beam_noise"] == best and config["beam_width"] == 2
 
 
+def test_trials_refuse_a_preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ValueError, match="leave preset out of -params"):
+        zoo_train(monkeypatch, tmp_path, "mcbs_td3", *WORDS, "--n-trials", "1", *PARAMS, "preset:'strong'")
+
+
 def test_invalid_combinations_do_not_end_a_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sampler, "ROLLOUT_DEPTHS", (0,))
     monkeypatch.setattr(sampler, "N_SIMULATIONS", (1, 5))

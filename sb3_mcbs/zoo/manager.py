@@ -90,6 +90,8 @@ class MCBSExperimentManager(ExperimentManager):
 
         A preset of the command line goes before what the file says of the search.
 
+        :raises ValueError: if trials that draw the search's settings are given a preset
+
         :return: the hyperparameters, and the same in order, to be saved
         """
         first_trial = self.trial_id == 0 and self.storage and self.study_name
@@ -98,7 +100,11 @@ class MCBSExperimentManager(ExperimentManager):
             trial = self.load_trial(str(self.storage), str(self.study_name), 0)
             self.custom_hyperparams = {**trial, **(self.custom_hyperparams or {})}
         custom = self.custom_hyperparams or {}
-        if self.algo in ALGORITHMS and not self.optimize_hyperparameters and "preset" in custom:
+        if self.algo in ALGORITHMS and custom.get("preset") is not None:
+            if self.optimize_hyperparameters:
+                raise ValueError(
+                    "Trials draw the search's settings and know no preset: leave preset out of -params."
+                )
             self.custom_hyperparams = with_preset(custom["preset"], custom)
         return super().read_hyperparameters()
 
@@ -164,6 +170,8 @@ def _checked_search_evaluation(settings: Any, algo: str) -> dict[str, Any]:
             "search_evaluation must be a dictionary of search settings such as "
             f"{{beam_width: 6, rollout_depth: 3}}, got {settings!r}."
         )
+    settings = dict(settings)
+    settings = with_preset(settings.pop("preset", None), settings)
     unknown = sorted(set(settings) - set(SearchSettings.names()))
     if unknown:
         raise ValueError(
@@ -171,7 +179,7 @@ def _checked_search_evaluation(settings: Any, algo: str) -> dict[str, Any]:
             f"Known are: {', '.join(SearchSettings.names())}."
         )
     SearchSettings(**settings)
-    return dict(settings)
+    return settings
 
 
 def _wrapped_for_search(wrapper: Callable[[gym.Env], gym.Env] | None) -> Callable[[gym.Env], gym.Env]:
