@@ -48,6 +48,17 @@ ALGORITHMS: dict[str, tuple[type[OffPolicyAlgorithm], dict[str, Any]]] = {
     "mcbs_ddpg": (MCBSDDPG, {"n_threads": 1, "rollout_replay": 0.25}),
     "mcbs_sac": (MCBSSAC, {"n_threads": 1, "use_sde": True, "entropy_bonus": True, "search_share": 0.5}),
     "mcbs_tqc": (MCBSTQC, {"n_threads": 1, "preset": "balanced", "tqc_value": "truncated"}),
+    "mcbs_td3 with schedules": (
+        MCBSTD3,
+        {
+            "n_threads": 1,
+            "search_schedule": "saturation",
+            "search_unit": "episode",
+            "search_share": 0.7,
+            "saturation_window": 1000,
+            "rollout_replay": 0.25,
+        },
+    ),
     "td3": (TD3, {}),
     "sac": (SAC, {}),
     "td3_one_rollout": (TD3, {"train_freq": 1_000_000}),
