@@ -195,15 +195,27 @@ def rollout_values(
             observation_of = (np.cumsum(open_rows) - 1)[row_of]
         actions = _spread(agent.policy(observations), observation_of)
         actions = clip_actions(actions + rollout_noise[depth, unfinished])
-        if depth + 1 < depth_limit:
-            if row_of is not None:
-                model.select(row_of)
-                row_of = None
-        else:
+        is_last = depth + 1 == depth_limit
+        if is_last or agent.entropy_bonus is not None:
             if observation_of is not None:
                 observations = take_rows(observations, observation_of)
-            returns[unfinished] += discount * agent.value(observations, actions).astype(np.float64)
+            returns[unfinished] += discount * _beyond_rewards(agent, observations, actions, is_last)
+        if not is_last and row_of is not None:
+            model.select(row_of)
+            row_of = None
     return returns.reshape(n_envs, beam, n_sim), first_step, simulated_steps
+
+
+def _beyond_rewards(agent: Agent, observations: Observations, actions: np.ndarray, is_last: bool) -> Any:
+    """What an action after the first is worth beside its rewards, in float64.
+
+    :param is_last: whether the critics' value closes the rollout.
+    :return: ``[rows]``.
+    """
+    worth = agent.value(observations, actions).astype(np.float64) if is_last else 0.0
+    if agent.entropy_bonus is not None:
+        worth = worth + agent.entropy_bonus(observations, actions).astype(np.float64)
+    return worth
 
 
 class RolloutRecorder:
