@@ -38,6 +38,8 @@ class SearchKeywords(TypedDict, total=False):
     n_rounds: int
     n_elites: int | None
     min_noise: float
+    noise_hold: int
+    proposal_dims: int | None
     search_schedule: str
     search_share: float
     search_unit: str
@@ -74,6 +76,8 @@ class SearchAttributes:
     n_rounds: int
     n_elites: int | None
     min_noise: float
+    noise_hold: int
+    proposal_dims: int | None
     search_schedule: str
     search_share: float
     search_unit: str
