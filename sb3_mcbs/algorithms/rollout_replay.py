@@ -64,7 +64,7 @@ class RolloutReplaySettings(CheckedSettings):
             )
         if settings.noise_hold > 1:
             raise ValueError(
-                "rollout_replay needs noise_hold=1: rollouts that hold their first noise do not follow the actor."
+                "rollout_replay needs noise_hold=1: rollouts that hold noise do not follow the actor."
             )
 
 

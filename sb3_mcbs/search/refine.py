@@ -2,8 +2,8 @@
 
 A candidate is a *plan*: what is added to the policy's action at each of the next ``rollout_depth`` steps,
 ``a_t = clip(pi(s_t) + plan_t, -1, 1)``. Plans are rolled out as Algorithm 1 rolls out its candidates, only
-that the noise of later steps belongs to the plan. With ``noise_hold`` a plan has an offset for each macro-step;
-``[..., rollout_depth, ...]`` are macro-steps then.
+that the noise of later steps belongs to the plan. With ``noise_hold`` above 1 a plan has one offset for each
+macro-step, and axes of ``rollout_depth`` count those.
 """
 
 from collections.abc import Sequence
@@ -137,7 +137,7 @@ def refit(
     :param plans: ``[n_envs, candidates, rollout_depth, act_dim]``, of all rounds until now.
     :param values: ``[n_envs, candidates, sim]``, theirs.
     :param settings: the number of elites, and the floor of the spread.
-    :param beginning: ``[rollout_depth, 1]``, standard deviations of the first round, which the floor is not above.
+    :param beginning: ``[rollout_depth, 1]``, standard deviations of the first round; caps the floor.
     :param directions: ``[proposal_dims, act_dim]``; ``None``: all.
     :return: mean and standard deviation of the elites.
     """
