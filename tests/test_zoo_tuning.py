@@ -81,17 +81,21 @@ def test_strategies_are_tuned_when_asked(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setenv(sampler.SWITCH, "strategies")
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
     seen: dict[str, int] = {}
+    held_or_narrow: set[tuple[int, int | None]] = set()
     for _ in range(400):
         trial = study.ask()
         try:
-            params = sampler.sample_mcbs_params("td3", trial, 1, 1, dict(NO_HER))
+            params = sampler.sample_mcbs_params("td3", trial, 3, 1, dict(NO_HER))
         except optuna.TrialPruned:
             assert trial.user_attrs["pruned"]
             continue
         settings = SearchSettings(**params)
         assert settings.simulated_steps(deterministic=False) <= sampler.MAX_SIMULATED_STEPS
         assert sampler.convert_mcbs_params(trial.params) == params
+        assert (settings.proposal_dims or 0) < 3, "three directions are all of them"
+        held_or_narrow.add((settings.noise_hold, settings.proposal_dims))
         seen[settings.strategy] = seen.get(settings.strategy, 0) + 1
+    assert {(1, None), (2, 1), (3, 2)} <= held_or_narrow
     assert set(seen) == set(sampler.STRATEGIES) and min(seen.values()) >= 5
 
 
