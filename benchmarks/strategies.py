@@ -161,6 +161,7 @@ def main() -> None:
     parser.add_argument("agent", type=Path, nargs="?", help="zip of a TD3, DDPG, SAC or TQC agent")
     parser.add_argument("env", nargs="?", help="its environment, for example HalfCheetah-v4")
     parser.add_argument("--seeds", choices=SEEDS, default="choosing")
+    parser.add_argument("--arms", choices=ARMS, nargs="+", metavar="ARM", help="only these, in this order")
     parser.add_argument("--most", type=int, default=1000, help="simulated steps of the arms that are run")
     parser.add_argument("--table", action="store_true", help="only show what was measured")
     arguments = parser.parse_args()
@@ -169,8 +170,8 @@ def main() -> None:
         return
     th.set_num_threads(1)
     agent = load_agent(arguments.agent, make_vec_env(arguments.env, 1), device="cpu")
-    arms = list(ARMS) if arguments.seeds == "choosing" else reported_arms(measured())
-    for arm in by_cost(arms):
+    arms = by_cost(list(ARMS) if arguments.seeds == "choosing" else reported_arms(measured()))
+    for arm in arguments.arms or arms:
         of = {
             "agent": arguments.agent.stem,
             "environment": arguments.env,
