@@ -21,6 +21,8 @@ from typing import Any
 
 import numpy as np
 import torch as th
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
@@ -30,6 +32,7 @@ from sb3_mcbs import SearchPolicy, SearchSettings, SnapshotEnvWrapper, load_agen
 from sb3_mcbs.search import PRESETS
 
 FILE = "strategies"
+FIGURE = RESULTS.parents[1] / "docs" / "images" / "strategies.png"
 SEEDS = {"choosing": range(100, 102), "reporting": range(200, 210)}
 #: On whose choosing seeds the arms that are reported of every agent were chosen.
 CHOSEN_WITH = "sac-HalfCheetah-v3"
@@ -156,6 +159,38 @@ def show(rows: list[dict[str, Any]]) -> None:
         print_table(header, sorted(table, key=lambda line: (round(line[4], -1), line[1])))
 
 
+def draw(rows: list[dict[str, Any]], path: Path) -> None:
+    """Draw returns against simulated steps, a panel for every agent.
+
+    :param rows: of the file of results.
+    :param path: of the figure.
+    """
+    agents = list(dict.fromkeys(row["agent"] for row in rows))
+    figure = Figure(figsize=(5.5 * len(agents), 4), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(1, len(agents), squeeze=False)[0]
+    for agent, panel in zip(agents, panels, strict=True):
+        of_agent = [row for row in rows if row["agent"] == agent]
+        actor = [np.mean(row["returns"]) for row in of_agent if row["arm"] == "actor alone"][-1]
+        panel.axhline(actor, color="grey", linestyle=":", label="actor alone")
+        for strategy, marker in (("beam", "o"), ("tree", "^"), ("refine", "s")):
+            for seeds, filled in (("choosing", False), ("reporting", True)):
+                points = [
+                    (row["simulated steps"], np.mean(row["returns"]))
+                    for row in of_agent
+                    if row["seeds"] == seeds
+                    and row["settings"].get("strategy", "beam") == strategy
+                    and row["simulated steps"] > 0
+                ]
+                if points:
+                    name = f"{strategy}, {seeds} seeds"
+                    face = None if filled else "none"
+                    panel.plot(*zip(*points, strict=True), marker, label=name, markerfacecolor=face)
+        panel.set(xscale="log", xlabel="simulated steps per decision", ylabel="return", title=agent)
+        panel.legend(fontsize=8)
+    figure.savefig(path, dpi=120)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("agent", type=Path, nargs="?", help="zip of a TD3, DDPG, SAC or TQC agent")
@@ -163,10 +198,11 @@ def main() -> None:
     parser.add_argument("--seeds", choices=SEEDS, default="choosing")
     parser.add_argument("--arms", choices=ARMS, nargs="+", metavar="ARM", help="only these, in this order")
     parser.add_argument("--most", type=int, default=1000, help="simulated steps of the arms that are run")
-    parser.add_argument("--table", action="store_true", help="only show what was measured")
+    parser.add_argument("--table", action="store_true", help="only show what was measured, and draw it")
     arguments = parser.parse_args()
     if arguments.table:
         show(measured())
+        draw(measured(), FIGURE)
         return
     th.set_num_threads(1)
     agent = load_agent(arguments.agent, make_vec_env(arguments.env, 1), device="cpu")
