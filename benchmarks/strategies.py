@@ -64,16 +64,17 @@ def run_arm(agent: OffPolicyAlgorithm, env_id: str, seeds: range, settings: dict
     predicted: list[list[float]] = [[] for _ in seeds]
     closing = np.zeros(len(seeds))
     simulated = evaluated = invalid = 0
-    seconds = 0.0
+    seconds = cpu_seconds = 0.0
     actions = np.zeros_like([env.action_space.sample() for _ in seeds])
     while running:
-        start = time.perf_counter()
+        start, cpu_start = time.perf_counter(), time.process_time()
         if settings.get("rollout_depth") == 0:
             result = searcher.search(observations[running], policy.rng)
         else:
             result = searcher.search(observations, policy.rng, running)
         searcher.note_actions(result.actions)
         seconds += time.perf_counter() - start
+        cpu_seconds += time.process_time() - cpu_start
         simulated += result.simulated_steps
         evaluated += result.critic_evaluations
         invalid += result.invalid_rollouts
@@ -97,6 +98,7 @@ def run_arm(agent: OffPolicyAlgorithm, env_id: str, seeds: range, settings: dict
         "simulated steps": simulated / decisions,
         "critic evaluations": evaluated / decisions,
         "ms": 1000 * seconds / decisions,
+        "cpu ms": 1000 * cpu_seconds / decisions,
         "invalid rollouts": invalid,
         "predicted": float(np.mean(np.concatenate(predicted))),
         "realised": float(np.mean(np.concatenate(realised))),
@@ -146,12 +148,12 @@ def measured() -> list[dict[str, Any]]:
 
 def show(rows: list[dict[str, Any]]) -> None:
     """Print a table for every agent and set of seeds."""
-    header = ["", "return", "least", "most", "simulated steps", "critic evaluations", "ms",
+    header = ["", "return", "least", "most", "simulated steps", "critic evaluations", "cpu ms",
               "predicted", "predicted - realised"]  # fmt: skip
     for agent, seeds in dict.fromkeys((row["agent"], row["seeds"]) for row in rows):
         table = [
             [row["arm"], float(np.mean(row["returns"])), min(row["returns"]), max(row["returns"]),
-             *(float(row[name]) for name in header[4:8]), row["predicted"] - row["realised"]]
+             *(float(row.get(name, "nan")) for name in header[4:8]), row["predicted"] - row["realised"]]
             for row in rows
             if (row["agent"], row["seeds"]) == (agent, seeds)
         ]  # fmt: skip
