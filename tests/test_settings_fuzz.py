@@ -77,6 +77,8 @@ VALID = {
     "min_noise": numbers(),
     "entropy_bonus": st.booleans(),
     "tqc_value": st.sampled_from(["mean", "truncated"]),
+    "noise_hold": integers(1, 3),
+    "proposal_dims": st.none() | integers(1, 1),  # actions have one entry here
 }
 assert VALID.keys() == set(SearchSettings.names())
 
@@ -97,9 +99,12 @@ def made(kwargs: dict[str, Any]) -> SearchSettings | None:
 
 def small(found: SearchSettings) -> bool:
     widest = max(found.beam_width, found.max_beam_width or 0)
-    factors = (found.n_simulations, max(found.rollout_depth, 1), found.branching, found.n_rounds)
+    factors = (found.n_simulations, max(found.horizon, 1), found.branching, found.n_rounds)
     return (
-        widest * math.prod(factors) <= 10_000 and (found.n_proposals or 0) <= 1000 and found.n_threads <= 64
+        widest * math.prod(factors) <= 10_000
+        and (found.n_proposals or 0) <= 1000
+        and found.n_threads <= 64
+        and (found.proposal_dims or 1) == 1
     )
 
 
@@ -118,12 +123,9 @@ def test_settings_are_refused_or_search_a_small_world(kwargs: dict[str, Any]) ->
     )
     rng, roots, observations = np.random.default_rng(0), [0.5, -1.0], np.array([[0.5], [-1.0]])
     if found.time_budget is None:
-        memory, moments = PlanMemory(2, found.rollout_depth, 1), [(0, 0), (0, 0)]
-        shape = (2, 1)
-        decision = Decision(
-            LineWorld(), roots, observations, agent, found, shape, rng, memory, range(2), moments
-        )
-        result = search(decision)
+        memory = PlanMemory(2, found.horizon, 1)
+        decision = Decision(LineWorld(), roots, observations, agent, found, (2, 1), rng)
+        result = search(decision._replace(memory=memory, envs=[0, 1], moments=[(0, 0), (0, 0)]))
     else:
         pace = Pace()
         deadline = pace.clock() + min(found.time_budget, 0.01)

@@ -113,20 +113,24 @@ def test_strategies_are_tuned_when_asked(base: str, monkeypatch: pytest.MonkeyPa
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
     seen: dict[str, int] = {}
     values = set()
+    held_or_narrow: set[tuple[int, int | None]] = set()
     for _ in range(400):
         trial = study.ask()
         try:
-            params = sampler.sample_mcbs_params(base, trial, 1, 1, dict(NO_HER))
+            params = sampler.sample_mcbs_params(base, trial, 3, 1, dict(NO_HER))
         except optuna.TrialPruned:
             assert trial.user_attrs["pruned"]
             continue
         settings = search_settings(params)
         assert settings.simulated_steps(deterministic=False) <= sampler.MAX_SIMULATED_STEPS
         assert sampler.convert_mcbs_params(trial.params) == params
+        assert (settings.proposal_dims or 0) < 3, "three directions are all of them"
+        held_or_narrow.add((settings.noise_hold, settings.proposal_dims))
         seen[settings.strategy] = seen.get(settings.strategy, 0) + 1
         values.add((settings.entropy_bonus, settings.tqc_value))
     assert {bonus for bonus, _ in values} == ({False, True} if base in ("sac", "tqc") else {False})
     assert {value for _, value in values} == ({"mean", "truncated"} if base == "tqc" else {"mean"})
+    assert {(1, None), (2, 1), (3, 2)} <= held_or_narrow
     assert set(seen) == set(sampler.STRATEGIES) and min(seen.values()) >= 5
 
 

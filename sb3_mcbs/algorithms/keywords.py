@@ -41,6 +41,8 @@ class SearchKeywords(TypedDict, total=False):
     min_noise: float
     entropy_bonus: bool
     tqc_value: str
+    noise_hold: int
+    proposal_dims: int | None
     search_schedule: str
     search_share: float
     search_unit: str
@@ -79,6 +81,8 @@ class SearchAttributes:
     min_noise: float
     entropy_bonus: bool
     tqc_value: str
+    noise_hold: int
+    proposal_dims: int | None
     search_schedule: str
     search_share: float
     search_unit: str

@@ -10,6 +10,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
@@ -26,7 +27,14 @@ from sb3_mcbs.algorithms.keywords import SearchAttributes, complete_settings, li
 from sb3_mcbs.algorithms.rollout_replay import RolloutReplay, RolloutReplaySettings, mixed_batches
 from sb3_mcbs.algorithms.searcher import Searcher
 from sb3_mcbs.algorithms.torch_settings import matmul_precision
-from sb3_mcbs.search import Rollouts, ScheduleSettings, SearchResult, SearchSchedule, SearchSettings
+from sb3_mcbs.search import (
+    RecentActions,
+    Rollouts,
+    ScheduleSettings,
+    SearchResult,
+    SearchSchedule,
+    SearchSettings,
+)
 
 SelfMCBS = TypeVar("SelfMCBS", bound="MCBS")
 
@@ -71,6 +79,7 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
 
         self.search_rng: np.random.Generator | None = None
         self._schedule: SearchSchedule | None = None
+        self.recent_actions: RecentActions | None = None
         self.n_decisions = 0
         self.n_simulated_steps = 0
         self.n_invalid_rollouts = 0
@@ -113,6 +122,8 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         if self._schedule is None:
             self._schedule = SearchSchedule(schedule, self.seed)
         self._schedule.settings = schedule
+        if self.recent_actions is None and settings.proposal_dims is not None:
+            self.recent_actions = RecentActions(get_action_dim(self.action_space))
         if self.rollout_replay:
             assert self.replay_buffer is not None
             RolloutReplay(self.replay_buffer, *schedule.most_rollouts(settings))  # makes room in it
@@ -135,7 +146,7 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         # What this environment's VecNormalize does is what the critics learn from.
         normalizer = unwrap_vec_normalize(env)
         normalize_reward = normalizer is not None and normalizer.norm_reward
-        self._searcher = Searcher(self, env, settings, normalize_reward)
+        self._searcher = Searcher(self, env, settings, normalize_reward, self.recent_actions)
         if self.verbose >= 1:
             print(f"Forward model: {self._searcher.description}")
 
@@ -243,6 +254,9 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         if diverged:
             leave_out_step(self, replay_buffer, new_obs)
             return
+        if self.num_timesteps - self.n_envs >= self.learning_starts:  # random actions have no directions
+            assert self._searcher is not None
+            self._searcher.note_actions(buffer_action)
         if self._decision is not None:
             assert self._searcher is not None
             error = self._searcher.model_error(*self._decision, new_obs, raw_reward, infos)

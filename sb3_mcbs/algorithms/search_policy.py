@@ -1,5 +1,6 @@
 """Act with search with any trained agent."""
 
+from copy import deepcopy
 from dataclasses import replace
 from typing import Any
 
@@ -63,7 +64,9 @@ class SearchPolicy:
         self.vec_env = _as_vec_env(vec_env)
         self.rng = np.random.default_rng(seed)
         self.last_result: SearchResult | None = None
-        self.searcher = Searcher(model, self.vec_env, self.settings, normalize_reward)
+        # A copy, so that acting elsewhere does not change the training.
+        recent_actions = deepcopy(model.recent_actions) if isinstance(model, MCBS) else None
+        self.searcher = Searcher(model, self.vec_env, self.settings, normalize_reward, recent_actions)
 
     def predict(
         self,
@@ -86,6 +89,7 @@ class SearchPolicy:
         space = self.model.observation_space
         batched, is_single = _add_batch_axis(observation, space)
         self.last_result = self.searcher.search(batched, self.rng)
+        self.searcher.note_actions(self.last_result.actions)
         actions = self.searcher.unscale(self.last_result.actions)
         return (actions[0] if is_single else actions), state
 

@@ -30,6 +30,7 @@ from sb3_mcbs.search import (
     Moment,
     Pace,
     PlanMemory,
+    RecentActions,
     SearchResult,
     SearchSettings,
     check_dynamics,
@@ -49,9 +50,11 @@ class Searcher:
     :param vec_env: the environments; those in this process are wrapped in place.
     :param settings: settings of the search.
     :param normalize_reward: see :class:`~sb3_mcbs.SearchPolicy`.
+    :param recent_actions: what the agent executed, for ``proposal_dims``; ``None``: nothing yet.
     :raises SnapshotUnsupportedError: if an environment's state cannot be captured.
     :raises ForwardModelError: if the requested forward model cannot simulate the environments.
-    :raises ValueError: if the settings make no sense with the agent or the environments' random dynamics.
+    :raises ValueError: if the settings make no sense with the agent, its actions or the environments' random
+        dynamics.
     """
 
     def __init__(
@@ -60,6 +63,7 @@ class Searcher:
         vec_env: VecEnv,
         settings: SearchSettings,
         normalize_reward: bool | None = None,
+        recent_actions: RecentActions | None = None,
     ) -> None:
         check_agent(agent)
         check_values(agent, settings)
@@ -67,6 +71,12 @@ class Searcher:
         self.settings = settings
         self._action_shape = agent.action_space.shape or ()
         self._act_dim = get_action_dim(agent.action_space)
+        if (settings.proposal_dims or 0) > self._act_dim:
+            raise ValueError(
+                f"proposal_dims must be at most {self._act_dim}, the entries of an action here; got "
+                f"{settings.proposal_dims}."
+            )
+        self.recent_actions = RecentActions(self._act_dim) if recent_actions is None else recent_actions
         space: Any = agent.action_space
         known = type(agent.policy).unscale_action is BasePolicy.unscale_action and space.dtype == np.float32
         self._low, self._half_range = space.low, 0.5 * (space.high - space.low) if known else None
@@ -81,7 +91,7 @@ class Searcher:
             self.model = make_forward_model(self.environments, settings.forward_model, settings.n_threads)
             check_dynamics(settings, self.model.deterministic)
             if settings.strategy == "refine":
-                self._plans = PlanMemory(len(self.environments), settings.rollout_depth, self._act_dim)
+                self._plans = PlanMemory(len(self.environments), settings.horizon, self._act_dim)
         self._functions = self._agent_functions()
 
     @property
@@ -121,12 +131,13 @@ class Searcher:
             roots = self._read_roots(envs)
             observations = self._present_observations(observations, envs)
         agent, settings = self.agent_functions(), effort or self.settings
+        dims = settings.proposal_dims
+        directions = None if dims is None else self.recent_actions.directions(dims)
         with one_thread(), matmul_precision(settings.matmul_precision):
             if settings.time_budget is None:
                 shape = (_n_rows(observations), self._act_dim)
-                decision = Decision(
-                    self.model, roots, observations, agent, settings, shape, rng, record=record
-                )
+                decision = Decision(self.model, roots, observations, agent, settings, shape, rng)
+                decision = decision._replace(record=record, directions=directions)
                 if self._plans is not None:
                     assert envs is not None
                     decision = decision._replace(memory=self._plans, envs=envs, moments=self._moments(envs))
@@ -135,7 +146,7 @@ class Searcher:
                 assert self.model is not None
                 deadline = start + settings.time_budget
                 result = deadline_search(
-                    self.model, roots, observations, agent, settings, deadline, self._pace, rng
+                    self.model, roots, observations, agent, settings, deadline, self._pace, rng, directions
                 )
         if result.invalid_rollouts or not is_finite(result.actions):
             _check_networks(agent.policy, agent.value, observations)
@@ -158,6 +169,14 @@ class Searcher:
             lambda array: array.reshape(*shape, *array.shape[1:]), self.view.observe(rows, normalize=False)
         )
         return result._replace(rollouts=rollouts._replace(observations=observations))
+
+    def note_actions(self, actions: np.ndarray) -> None:
+        """Remember what is executed, if the search learns directions from it.
+
+        :param actions: ``[n, *]``, scaled.
+        """
+        if self.settings.proposal_dims is not None:
+            self.recent_actions.note(actions.reshape(len(actions), -1))
 
     def model_error(
         self,
@@ -208,11 +227,14 @@ class Searcher:
             "deterministic": None if model is None else model.deterministic,
             "previous_step_differed": self._previous_step_differed,
             "plans": None if self._plans is None else self._plans.state(self._moments(self._all_envs)),
+            "recent_actions": None if self.settings.proposal_dims is None else self.recent_actions.state(),
         }
 
     @memory.setter
     def memory(self, memory: dict[str, Any]) -> None:
         self._previous_step_differed = memory["previous_step_differed"]
+        if memory.get("recent_actions") is not None:
+            self.recent_actions.set_state(memory["recent_actions"])
         if self.model is None:
             return
         if self._plans is not None and memory.get("plans") is not None:

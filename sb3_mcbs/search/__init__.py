@@ -2,6 +2,7 @@
 
 from sb3_mcbs.search.beam import beam_search
 from sb3_mcbs.search.deadline import Pace, deadline_search
+from sb3_mcbs.search.directions import RecentActions
 from sb3_mcbs.search.interface import Agent, FirstStep, Rollouts, SearchResult
 from sb3_mcbs.search.memory import Moment, PlanMemory
 from sb3_mcbs.search.proposals import Noise, draw_noise
@@ -18,6 +19,7 @@ __all__ = [
     "Noise",
     "Pace",
     "PlanMemory",
+    "RecentActions",
     "Rollouts",
     "ScheduleSettings",
     "SearchResult",

@@ -31,6 +31,8 @@ STRATEGIES = ("beam", "tree", "refine")
 PROPOSAL_FACTORS = (1, 4, 8)
 BRANCHING = (2, 3, 5)
 N_ROUNDS = (2, 3, 4)
+NOISE_HOLD = (1, 2, 3)
+PROPOSAL_DIMS = (None, 1, 2, 3)
 SEARCH_SHARES = (0.25, 0.5, 1.0)
 #: As parts of ``search_share``.
 FINAL_SEARCH_SHARES = (0.0, 0.2, 0.5)
@@ -82,7 +84,7 @@ def sample_mcbs_params(
     if scope == "schedules":
         sampled |= _sample_schedule(trial)
     params = _search_settings(sampled)
-    reason = _why_senseless(params, sampled)
+    reason = _why_senseless(params, sampled, n_actions)
     if reason is not None:
         trial.set_user_attr("pruned", reason)
         raise optuna.TrialPruned(f"{reason}: {params}")
@@ -100,6 +102,8 @@ def _sample_strategy(trial: optuna.Trial, base: str, rollout_depth: int) -> dict
         "strategy": strategy,
         "antithetic": trial.suggest_categorical("antithetic", (False, True)),
         "proposal_factor": trial.suggest_categorical("proposal_factor", PROPOSAL_FACTORS),
+        "noise_hold": trial.suggest_categorical("noise_hold", NOISE_HOLD),
+        "proposal_dims": trial.suggest_categorical("proposal_dims", PROPOSAL_DIMS),
     }
     if strategy == "beam":
         for name in ("noise_free_rollouts", "include_policy_action", "common_noise"):
@@ -144,11 +148,13 @@ def _search_settings(sampled: dict[str, Any]) -> dict[str, Any]:
     return settings
 
 
-def _why_senseless(params: dict[str, Any], sampled: dict[str, Any]) -> str | None:
+def _why_senseless(params: dict[str, Any], sampled: dict[str, Any], n_actions: int) -> str | None:
     if params["rollout_depth"] == 0 and params["n_simulations"] > 1:
         return "nothing is simulated at rollout_depth 0, so n_simulations above 1 repeats another trial"
     if sampled["n_simulations"] > 1 and (params["n_simulations"] == 1 or params.get("rollout_noise") == 0):
         return "n_simulations above 1 needs a beam with noise in its rollouts, else it repeats another trial"
+    if (params.get("proposal_dims") or 0) >= n_actions:
+        return f"proposal_dims of {n_actions} or more repeats another trial: actions have no more directions"
     try:
         settings = SearchSettings(**_of(params, SearchSettings))
         ScheduleSettings(**_of(params, ScheduleSettings)).check_search(settings)
