@@ -9,8 +9,8 @@ seeds and reported on another:
 
 The second runs what was best of each strategy and budget in the first, and the presets. Arms are named by
 their sizes: beam candidates x depth, tree width x branching x depth, refine width x rounds x depth; (2x3) is
-a depth of 2 macro-steps of 3 steps, "in 2" two directions, "of 48" critic pre-selection. Arms that the file
-of results holds already are left out.
+a depth of 2 macro-steps of 3 steps, "in 2" two directions, "of 48" critic pre-selection, "soft" entropy_bonus,
+"truncated" tqc_value. Arms that the file of results holds already are left out.
 """
 
 import argparse
@@ -27,7 +27,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from benchmarks.common import RESULTS, print_table, write
-from benchmarks.strategies_arms import ARMS, BUDGETS, SLACK
+from benchmarks.strategies_arms import ARMS, BUDGETS, SLACK, has_value
 from sb3_mcbs import SearchPolicy, SearchSettings, SnapshotEnvWrapper, load_agent
 from sb3_mcbs.search import PRESETS
 
@@ -132,7 +132,7 @@ def reported_arms(rows: list[dict[str, Any]]) -> list[str]:
         best[ARMS[arm].get("strategy", "beam"), budget_of(arm)] = arm
     presets = [SearchSettings.preset(name) for name in PRESETS]
     wanted = {"actor alone", *best.values(), *(arm for arm in ARMS if SearchSettings(**ARMS[arm]) in presets)}
-    return [arm for arm in ARMS if arm in wanted]
+    return [arm for arm in ARMS if arm in wanted or arm.endswith((", soft", ", truncated"))]
 
 
 def by_cost(arms: list[str]) -> list[str]:
@@ -219,7 +219,8 @@ def main() -> None:
         rows, settings = measured(), ARMS[arm]
         # Others may have added arms meanwhile, so the file is read again.
         done = any(of.items() <= row.items() and row["settings"] == settings for row in rows)
-        if done or SearchSettings(**settings).simulated_steps() > arguments.most:
+        costly = SearchSettings(**settings).simulated_steps() > arguments.most
+        if done or costly or not has_value(agent, settings):
             continue
         result = run_arm(agent, arguments.env, SEEDS[arguments.seeds], settings)
         write(FILE, [*measured(), {**of, "settings": settings, **result}])

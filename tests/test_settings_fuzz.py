@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.noise import NormalActionNoise
 
-from sb3_mcbs import MCBSTD3, SearchPolicy, SearchSettings, SnapshotEnvWrapper
+from sb3_mcbs import MCBSTD3, MCBSTQC, SearchPolicy, SearchSettings, SnapshotEnvWrapper
 from sb3_mcbs.search import Agent, Decision, Pace, PlanMemory, deadline_search, search
 from tests.conftest import SMALL, snapshot_vec_env
 from tests.fake_model import LineWorld
@@ -74,6 +74,8 @@ VALID = {
     "n_rounds": integers(1, 3),
     "n_elites": st.none() | integers(1, 5),
     "min_noise": numbers(),
+    "entropy_bonus": st.booleans(),
+    "tqc_value": st.sampled_from(["mean", "truncated"]),
     "noise_hold": integers(1, 3),
     "proposal_dims": st.none() | integers(1, 1),  # actions have one entry here
 }
@@ -132,10 +134,10 @@ def test_settings_are_refused_or_search_a_small_world(kwargs: dict[str, Any]) ->
 
 
 @pytest.fixture(scope="module")
-def pendulums() -> dict[str, tuple[MCBSTD3, Any]]:
-    """An agent and its environments for each kind of forward model."""
+def pendulums() -> dict[str, tuple[MCBSTQC, Any]]:
+    """An agent that no setting is refused for and its environments, for each kind of forward model."""
     return {
-        env_id: (MCBSTD3("MlpPolicy", env_id, seed=0, n_threads=1, **SMALL), snapshot_vec_env(env_id, 2))
+        env_id: (MCBSTQC("MlpPolicy", env_id, seed=0, n_threads=1, **SMALL), snapshot_vec_env(env_id, 2))
         for env_id in ("Pendulum-v1", "InvertedPendulum-v5")
     }
 

@@ -23,7 +23,7 @@ from sb3_mcbs.algorithms.faults import (
     leave_out_step,
     warn_of_divergence,
 )
-from sb3_mcbs.algorithms.keywords import SearchAttributes, list_search_settings, setting_fields
+from sb3_mcbs.algorithms.keywords import SearchAttributes, complete_settings, list_search_settings
 from sb3_mcbs.algorithms.rollout_replay import RolloutReplay, RolloutReplaySettings, mixed_batches
 from sb3_mcbs.algorithms.searcher import Searcher
 from sb3_mcbs.algorithms.torch_settings import matmul_precision
@@ -48,7 +48,7 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         class MCBSSAC(MCBS, SAC):
             def __init__(self, policy, env, ..., **search_settings: Unpack[SearchKeywords]) -> None:
                 super().__init__(policy, env, ..., _init_setup_model=False)
-                self._init_search(action_noise_after_search, search_settings)
+                self._init_search(action_noise_after_search, search_settings, preset)
                 if _init_setup_model:
                     self._setup_model()
 
@@ -60,23 +60,21 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         super().__init_subclass__(**kwargs)
         list_search_settings(cls)
 
-    def _init_search(self, action_noise_after_search: bool, settings: Mapping[str, object]) -> None:
+    def _init_search(
+        self, action_noise_after_search: bool, settings: Mapping[str, object], preset: str | None = None
+    ) -> None:
         """
         Take over the constructor's arguments for the search.
 
         :param action_noise_after_search: add ``action_noise`` to searched actions too
         :param settings: fields of :data:`SETTINGS`; those not given have their defaults
+        :param preset: where they start from, see :func:`~sb3_mcbs.search.with_preset`
         :raises TypeError: if there is no such setting
+        :raises ValueError: if there is no such preset
         """
-        known = {field.name: field.default for field in setting_fields()}
-        unknown = sorted(settings.keys() - known.keys())
-        if unknown:
-            raise TypeError(
-                f"{type(self).__name__} got unexpected keyword arguments {unknown}; the settings of the "
-                f"search are {list(known)}."
-            )
-        for name, default in known.items():
-            setattr(self, name, settings.get(name, default))
+        for name, value in complete_settings(type(self).__name__, settings, preset).items():
+            setattr(self, name, value)
+        self.preset = self._preset_taken_over = preset
         self.action_noise_after_search = action_noise_after_search
 
         self.search_rng: np.random.Generator | None = None
@@ -106,6 +104,11 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
 
     def _setup_model(self) -> None:
         # ``load`` sets attributes without calling the constructor, so settings are checked here.
+        if self.preset != self._preset_taken_over:
+            raise ValueError(
+                f"preset={self.preset!r} is for constructors. Give the settings of a saved agent one by one: "
+                f"load(path, **PRESETS[{self.preset!r}])."
+            )
         settings, schedule = self.search_settings, self.schedule_settings
         schedule.check_search(settings)
         RolloutReplaySettings.of(self).check_search(settings)

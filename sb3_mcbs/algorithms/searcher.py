@@ -12,7 +12,13 @@ from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_mcbs.algorithms.faults import NonFiniteError, check_observations, is_finite
-from sb3_mcbs.algorithms.networks import check_agent, policy_function, value_function
+from sb3_mcbs.algorithms.networks import (
+    check_agent,
+    check_values,
+    entropy_function,
+    policy_function,
+    value_function,
+)
 from sb3_mcbs.algorithms.torch_settings import matmul_precision, one_thread
 from sb3_mcbs.algorithms.vec_env_view import VecEnvView, reward_normalizer, snapshot_environments
 from sb3_mcbs.models import Environments, ForwardModel, ForwardModelError, make_forward_model
@@ -47,7 +53,8 @@ class Searcher:
     :param recent_actions: what the agent executed, for ``proposal_dims``; ``None``: nothing yet.
     :raises SnapshotUnsupportedError: if an environment's state cannot be captured.
     :raises ForwardModelError: if the requested forward model cannot simulate the environments.
-    :raises ValueError: if the settings make no sense with the environments' random dynamics or actions.
+    :raises ValueError: if the settings make no sense with the agent, its actions or the environments' random
+        dynamics.
     """
 
     def __init__(
@@ -59,6 +66,7 @@ class Searcher:
         recent_actions: RecentActions | None = None,
     ) -> None:
         check_agent(agent)
+        check_values(agent, settings)
         self.agent = agent
         self.settings = settings
         self._action_shape = agent.action_space.shape or ()
@@ -248,16 +256,23 @@ class Searcher:
         return self._functions._replace(gamma=self.agent.gamma)
 
     def _agent_functions(self) -> Agent:
-        policy, value, gamma = policy_function(self.agent), value_function(self.agent), self.agent.gamma
+        policy, gamma = policy_function(self.agent), self.agent.gamma
+        value = value_function(self.agent, self.settings.tqc_value)
         if self.model is None:
             return Agent(policy, value, gamma, self.unscale, lambda rewards: rewards)
         observe = self.view.observe
-        return Agent(
+        agent = Agent(
             policy=lambda observations: policy(observe(observations)),
             value=lambda observations, actions: value(observe(observations), actions),
             gamma=gamma,
             unscale_action=self.unscale,
             scale_reward=self.view.scale_reward,
+        )
+        if not self.settings.entropy_bonus:
+            return agent
+        bonus = entropy_function(self.agent)
+        return agent._replace(
+            entropy_bonus=lambda observations, actions: bonus(observe(observations), actions)
         )
 
     def unscale(self, actions: np.ndarray) -> np.ndarray:

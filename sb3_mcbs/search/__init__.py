@@ -7,7 +7,7 @@ from sb3_mcbs.search.interface import Agent, FirstStep, Rollouts, SearchResult
 from sb3_mcbs.search.memory import Moment, PlanMemory
 from sb3_mcbs.search.proposals import Noise, draw_noise
 from sb3_mcbs.search.schedule import ScheduleSettings, SearchSchedule
-from sb3_mcbs.search.settings import PRESETS, SearchSettings
+from sb3_mcbs.search.settings import PRESETS, SearchSettings, with_preset
 from sb3_mcbs.search.strategies import Decision, check_dynamics, search
 
 __all__ = [
@@ -30,4 +30,5 @@ __all__ = [
     "deadline_search",
     "draw_noise",
     "search",
+    "with_preset",
 ]

@@ -203,13 +203,13 @@ def rollout_values(
             if unfinished is not _ALL:
                 unfinished = _split(unfinished, shared)
             rows = np.repeat(np.arange(len(actions) // shared) if rows is None else rows, shared)
-            if is_last:
+            if is_last or agent.entropy_bonus is not None:
                 observations = take_rows(observations, np.arange(len(actions)) // shared)
         held = first_noise if step_number < hold else later_noise[step_number // hold - 1]
         actions = clip_actions(actions + held[unfinished])
-        if is_last:
-            returns[unfinished] += discount * agent.value(observations, actions).astype(np.float64)
-        elif rows is not None:
+        if is_last or agent.entropy_bonus is not None:
+            returns[unfinished] += discount * _beyond_rewards(agent, observations, actions, is_last)
+        if not is_last and rows is not None:
             model.select(rows)
     return _of_simulations(returns, n_envs, beam, n_sim), first_step, simulated_steps
 
@@ -223,6 +223,18 @@ def _of_simulations(values: np.ndarray, n_envs: int, beam: int, n_sim: int) -> n
     """Give every simulation its value, also those that ended before they differed."""
     values = np.repeat(values, n_envs * beam * n_sim // len(values), axis=0)
     return values.reshape(n_envs, beam, n_sim, *values.shape[1:])
+
+
+def _beyond_rewards(agent: Agent, observations: Observations, actions: np.ndarray, is_last: bool) -> Any:
+    """What an action after the first is worth beside its rewards, in float64.
+
+    :param is_last: whether the critics' value closes the rollout.
+    :return: ``[rows]``.
+    """
+    worth = agent.value(observations, actions).astype(np.float64) if is_last else 0.0
+    if agent.entropy_bonus is not None:
+        worth = worth + agent.entropy_bonus(observations, actions).astype(np.float64)
+    return worth
 
 
 class RolloutRecorder:

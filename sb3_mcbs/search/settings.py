@@ -2,6 +2,7 @@
 
 import math
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +19,7 @@ MAX_NOISE = 1e6
 MAX_THREADS = 1024
 MATMUL_PRECISIONS = ("highest", "high", "medium")
 STRATEGIES = ("beam", "tree", "refine")
+TQC_VALUES = ("mean", "truncated")
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,10 @@ class SearchSettings(CheckedSettings):
     :param n_elites: the best plans that a round of a refinement goes on from. ``None``: a quarter of
         ``beam_width``.
     :param min_noise: what the spread of a refinement does not fall below, in the scaled action space.
+    :param entropy_bonus: of SAC and TQC, whether values are soft: every action after the first, the last one
+        included, adds ``-ent_coef * log pi(a|s)``, as in the critics' target. With the strategy ``"beam"``.
+    :param tqc_value: of TQC, ``"mean"`` of all quantiles of all critics, or ``"truncated"``: without the
+        ``top_quantiles_to_drop_per_net`` highest per critic of them all, as in the critics' target.
     :param noise_hold: environment steps in a macro-step, in which all noise stays the same while the policy
         goes on reacting. A rollout simulates ``rollout_depth * noise_hold`` environment steps.
     :param proposal_dims: candidates (of a tree: all children, of a refinement: whole plans) differ only in so
@@ -91,6 +97,8 @@ class SearchSettings(CheckedSettings):
     n_rounds: int = 3
     n_elites: int | None = None
     min_noise: float = 0.02
+    entropy_bonus: bool = False
+    tqc_value: str = "mean"
     noise_hold: int = 1
     proposal_dims: int | None = None
 
@@ -111,16 +119,19 @@ class SearchSettings(CheckedSettings):
                 self._set_number(name, MAX_NOISE)
         if self.n_elites is not None:
             self._set_integer("n_elites", 1, self.beam_width)
-        for name in ("include_policy_action", "common_noise", "antithetic", "one_node_per_root"):
+        flags = ("include_policy_action", "common_noise", "antithetic", "one_node_per_root", "entropy_bonus")
+        for name in flags:
             self._check_flag(name)
         self._check_name("forward_model", KINDS)
         self._check_name("strategy", STRATEGIES)
+        self._check_name("tqc_value", TQC_VALUES)
         if self.matmul_precision is not None:
             self._check_name("matmul_precision", MATMUL_PRECISIONS, "None")
 
         self._check_strategy()
         self._check_proposals()
         self._check_common_noise()
+        self._check_entropy_bonus()
         self._check_hierarchy()
         self._check_budget()
         self._check_size()
@@ -220,6 +231,19 @@ class SearchSettings(CheckedSettings):
                 "rollout_noise and noise_clip: leave it out."
             )
 
+    def _check_entropy_bonus(self) -> None:
+        if not self.entropy_bonus:
+            return
+        if self.rollout_depth == 0:
+            raise ValueError(
+                "entropy_bonus needs a rollout_depth of 1 or more: it is for the actions after the first."
+            )
+        if self.strategy != "beam":
+            raise ValueError(
+                f"entropy_bonus works with strategy='beam' only, got strategy={self.strategy!r}: where later "
+                "actions are chosen by their value, it would favour those that the policy never takes."
+            )
+
     def _check_hierarchy(self) -> None:
         if self.noise_hold > 1:
             if self.rollout_depth == 0:
@@ -288,9 +312,8 @@ class SearchSettings(CheckedSettings):
         :return: the settings.
         :raises ValueError: if there is no preset of that name.
         """
-        if not isinstance(name, str) or name not in PRESETS:
-            raise ValueError(f"There is no preset {name!r}; known are {', '.join(PRESETS)}.")
-        return cls(**{**PRESETS[name], **changes})
+        _check_preset(name)
+        return cls(**with_preset(name, changes))
 
 
 #: The settings that presets change, by the names of the presets. Around trained agents in deterministic
@@ -309,3 +332,22 @@ PRESETS: dict[str, dict[str, Any]] = {
         antithetic=True,
     ),
 }
+
+
+def with_preset(name: str | None, changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Start from a preset.
+
+    :param name: one of :data:`PRESETS`; ``None``: there is none.
+    :param changes: settings that stay as they are, whatever the preset says.
+    :return: the preset's settings and those.
+    :raises ValueError: if there is no preset of that name.
+    """
+    if name is None:
+        return dict(changes)
+    _check_preset(name)
+    return {**PRESETS[name], **changes}
+
+
+def _check_preset(name: object) -> None:
+    if not isinstance(name, str) or name not in PRESETS:
+        raise ValueError(f"There is no preset {name!r}; known are {', '.join(PRESETS)}.")

@@ -4,7 +4,8 @@ What ``-optimize`` draws for our algorithms, and how a trial's parameters become
 By default only the size and noise of the search are tuned and the other settings of the hyperparameter file
 are held, so that trials differ in one thing. ``SB3_MCBS_TUNE=strategies`` tunes how it searches as well,
 ``SB3_MCBS_TUNE=schedules`` when it searches and what is learned from it, ``SB3_MCBS_TUNE=all`` what RL Zoo
-tunes of the algorithm without search.
+tunes of the algorithm without search. Trials know no ``preset``: one in
+the hyperparameter file would change what a trial does not draw.
 """
 
 import os
@@ -17,6 +18,7 @@ from sb3_mcbs.algorithms.rollout_replay import RolloutReplaySettings
 from sb3_mcbs.search import ScheduleSettings, SearchSettings
 from sb3_mcbs.search.checks import CheckedSettings
 from sb3_mcbs.search.schedule import SCHEDULES, UNITS
+from sb3_mcbs.search.settings import TQC_VALUES
 
 SWITCH = "SB3_MCBS_TUNE"
 SCOPES = ("search", "strategies", "schedules", "all")
@@ -41,6 +43,8 @@ MAX_SIMULATED_STEPS = 600
 
 #: What trials store of a strategy under names that are no settings themselves.
 _HELPERS = ("proposal_factor", "noise_free_rollouts", "final_share_factor")
+
+_NO_PRESET: dict[str, Any] = {"preset": None}
 
 
 def tuning_scope() -> str:
@@ -76,7 +80,7 @@ def sample_mcbs_params(
         "beam_noise": trial.suggest_float("beam_noise", *BEAM_NOISE, log=True),
     }
     if scope == "strategies":
-        sampled |= _sample_strategy(trial)
+        sampled |= _sample_strategy(trial, base, sampled["rollout_depth"])
     if scope == "schedules":
         sampled |= _sample_schedule(trial)
     params = _search_settings(sampled)
@@ -88,10 +92,10 @@ def sample_mcbs_params(
         from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
 
         params.update(HYPERPARAMS_SAMPLER[base](trial, n_actions, n_envs, additional_args))
-    return params
+    return {**params, **_NO_PRESET}
 
 
-def _sample_strategy(trial: optuna.Trial) -> dict[str, Any]:
+def _sample_strategy(trial: optuna.Trial, base: str, rollout_depth: int) -> dict[str, Any]:
     """Draw how to search, by the names that the trial stores."""
     strategy = trial.suggest_categorical("strategy", STRATEGIES)
     sampled: dict[str, Any] = {
@@ -104,11 +108,15 @@ def _sample_strategy(trial: optuna.Trial) -> dict[str, Any]:
     if strategy == "beam":
         for name in ("noise_free_rollouts", "include_policy_action", "common_noise"):
             sampled[name] = trial.suggest_categorical(name, (False, True))
+        if base in ("sac", "tqc") and rollout_depth:
+            sampled["entropy_bonus"] = trial.suggest_categorical("entropy_bonus", (False, True))
     elif strategy == "tree":
         sampled["branching"] = trial.suggest_categorical("branching", BRANCHING)
         sampled["one_node_per_root"] = trial.suggest_categorical("one_node_per_root", (False, True))
     else:
         sampled["n_rounds"] = trial.suggest_categorical("n_rounds", N_ROUNDS)
+    if base == "tqc":
+        sampled["tqc_value"] = trial.suggest_categorical("tqc_value", TQC_VALUES)
     return sampled
 
 
@@ -171,6 +179,7 @@ def convert_mcbs_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     """
     search_names = {*_HELPERS, *(name for settings in SETTINGS for name in settings.names())}
     search = _search_settings({name: v for name, v in sampled_params.items() if name in search_names})
+    search |= _NO_PRESET
     others = {name: value for name, value in sampled_params.items() if name not in search_names}
     if not others:
         return search
