@@ -9,8 +9,8 @@ seeds and reported on another:
 
 The second runs what was best of each strategy and budget in the first, and the presets. Arms are named by
 their sizes: beam candidates x depth, tree width x branching x depth, refine width x rounds x depth; (2x3) is
-a depth of 2 macro-steps of 3 steps, "in 2" two directions, "of 48" critic pre-selection, "soft" entropy_bonus,
-"truncated" tqc_value. Arms that the file of results holds already are left out.
+a depth of 2 macro-steps of 3 steps, "in 2" two directions, "of 48" critic pre-selection, "soft"
+entropy_bonus, "truncated" tqc_value. Arms that the file of results holds already are left out.
 """
 
 import argparse
