@@ -8,8 +8,8 @@ import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
+from sb3_mcbs.algorithms.learned_search import make_searcher
 from sb3_mcbs.algorithms.mcbs import MCBS
-from sb3_mcbs.algorithms.searcher import Searcher
 from sb3_mcbs.search import SearchResult, SearchSettings
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 
@@ -58,7 +58,7 @@ class SearchPolicy:
         self.vec_env = _as_vec_env(vec_env)
         self.rng = np.random.default_rng(seed)
         self.last_result: SearchResult | None = None
-        self.searcher = Searcher(model, self.vec_env, self.settings, normalize_reward)
+        self.searcher = make_searcher(model, self.vec_env, self.settings, normalize_reward)
 
     def predict(
         self,

@@ -14,7 +14,12 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_mcbs.algorithms.faults import NonFiniteError, check_observations, is_finite
 from sb3_mcbs.algorithms.networks import check_agent, policy_function, value_function
 from sb3_mcbs.algorithms.torch_settings import matmul_precision, one_thread
-from sb3_mcbs.algorithms.vec_env_view import VecEnvView, reward_normalizer, snapshot_environments
+from sb3_mcbs.algorithms.vec_env_view import (
+    AgentView,
+    VecEnvView,
+    reward_normalizer,
+    snapshot_environments,
+)
 from sb3_mcbs.models import Environments, ForwardModel, ForwardModelError, make_forward_model
 from sb3_mcbs.models.base import Observations
 from sb3_mcbs.models.copies import stack
@@ -67,15 +72,27 @@ class Searcher:
         self._previous_step_differed = False
         self._pace = Pace()
         self._plans: PlanMemory | None = None
+        self.view: AgentView
         if settings.rollout_depth > 0:
-            self.view = VecEnvView(vec_env, reward_normalizer(agent.get_env(), vec_env, normalize_reward))
-            self.environments: Environments = snapshot_environments(self.view.base)
-            self._all_envs = range(len(self.environments))
-            self.model = make_forward_model(self.environments, settings.forward_model, settings.n_threads)
-            check_dynamics(settings, self.model.deterministic)
-            if settings.strategy == "refine":
-                self._plans = PlanMemory(len(self.environments), settings.rollout_depth, self._act_dim)
+            self._connect(vec_env, normalize_reward)
         self._functions = self._agent_functions()
+
+    def _connect(self, vec_env: VecEnv, normalize_reward: bool | None) -> None:
+        """Make the forward model, and the view of the environments."""
+        agent, settings = self.agent, self.settings
+        view = VecEnvView(vec_env, reward_normalizer(agent.get_env(), vec_env, normalize_reward))
+        self.view = view
+        self.environments: Environments = snapshot_environments(view.base)
+        self._all_envs = range(len(self.environments))
+        self.model = make_forward_model(self.environments, settings.forward_model, settings.n_threads)
+        check_dynamics(settings, self.model.deterministic)
+        if settings.strategy == "refine":
+            self._plans = PlanMemory(len(self.environments), settings.rollout_depth, self._act_dim)
+
+    @property
+    def ready(self) -> bool:
+        """Whether the forward model may be used already."""
+        return True
 
     @property
     def description(self) -> str:
@@ -106,13 +123,12 @@ class Searcher:
         start = self._pace.clock()
         if self.agent.policy.training:
             self.agent.policy.set_training_mode(False)
-        if envs is not None:
-            observations = take_rows(observations, np.asarray(envs))
         roots: list[Any] = []
         if self.model is not None:
             envs = self._all_envs if envs is None else envs
-            roots = self._read_roots(envs)
-            observations = self._present_observations(observations, envs)
+            roots, observations = self._look(observations, envs)
+        elif envs is not None:
+            observations = take_rows(observations, np.asarray(envs))
         agent, settings = self.agent_functions(), effort or self.settings
         with one_thread(), matmul_precision(settings.matmul_precision):
             if settings.time_budget is None:
@@ -246,8 +262,18 @@ class Searcher:
         unscaled += self._low
         return unscaled
 
+    def _look(self, observations: Observations, envs: Sequence[int]) -> tuple[list[Any], Observations]:
+        """Where the rollouts start: roots, and the observations there as the forward model has them.
+
+        :param observations: ``[n_envs, *]``, of all environments as the agent was given them.
+        :param envs: which environments.
+        """
+        roots = self._read_roots(envs)
+        return roots, self._present_observations(take_rows(observations, np.asarray(envs)), envs)
+
     def _present_observations(self, observations: Observations, envs: Sequence[int]) -> Observations:
         """The environments' own observations, checked against those that the agent was given."""
+        assert isinstance(self.view, VecEnvView)
         present = self.environments.apply(envs, _last_observation)
         for row, observation in enumerate(present):
             if observation is None:
