@@ -28,11 +28,12 @@ class EnsembleSettings(CheckedSettings):
     :param ensemble_train_freq: environment steps between two fits of the model.
     :param ensemble_gradient_steps: most gradient steps of a fit.
     :param ensemble_max_error: the agent searches once the model's held-out error is at most this, and acts as
-        it does without search until then and whenever the error is higher again. The error is the root mean
-        square, over one step of held-out transitions, in units of standard deviations of what is predicted:
-        0 is perfect, 1 as bad as always predicting the mean change of observations and the mean reward.
+        it does without search until then and whenever the error is higher again. The error is the mean
+        absolute error of one step of held-out transitions as a part of the mean absolute deviation of what is
+        predicted, averaged over the entries of the observation and the reward: 0 is perfect, 1 as bad as
+        always predicting the mean change of observations and the mean reward.
     :param ensemble_pessimism: how much the disagreement of the networks lowers a predicted reward: this times
-        the disagreement (in the same units as the error) times the standard deviation of rewards.
+        the disagreement (1: as much as what is predicted varies) times the standard deviation of rewards.
     :raises TypeError: if a value has the wrong type.
     :raises ValueError: if a value is out of range.
     """

@@ -134,7 +134,7 @@ class LearnedSearcher(Searcher):
         :param observations: ``[n_envs, *]``, what the agent received next.
         :param rewards: ``[n_envs]``, of the environments, not normalised.
         :param infos: one per environment; where an episode ended the last observation is in it.
-        :return: root mean square in the units of the held-out error; ``None`` if no action was executed.
+        :return: the error, measured as the held-out error is; ``None`` if no action was executed.
         """
         executed = np.flatnonzero(result.chosen >= 0)
         if not len(executed):

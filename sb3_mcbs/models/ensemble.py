@@ -16,6 +16,8 @@ PATIENCE = 3
 #: More rows than these, evenly spaced, change neither statistics nor a held-out error noticeably.
 _STATISTICS_ROWS = 100_000
 _HELD_OUT_ROWS = 2_000
+#: What is left of a constant after rounding, relative to it.
+_NO_VARIATION = 1e-6
 
 
 class Transitions(NamedTuple):
@@ -72,9 +74,10 @@ class Ensemble:
     :param rng: draws the initial weights.
     :param device: where it is computed.
 
-    :ivar held_out_error: root mean square, over held-out transitions and all targets, of the prediction's
-        error in units of the targets' standard deviations. 0 is perfect, 1 as bad as always predicting the
-        mean change and the mean reward; infinite before the first fit.
+    :ivar held_out_error: the mean absolute error of the prediction over held-out transitions, as a part of
+        the target's mean absolute deviation, averaged over targets. 0 is perfect, 1 as bad as always
+        predicting the mean change and the mean reward; infinite before the first fit. Not of squares: a few
+        collisions, which nobody can predict, would be all that it tells of.
     :ivar termination_error: the share of held-out transitions whose termination is predicted wrongly.
     :ivar predicts_termination: whether a termination was among the transitions. Otherwise none is predicted.
     """
@@ -85,6 +88,7 @@ class Ensemble:
         self._network = EnsembleNetwork(size, obs_dim + act_dim, obs_dim + 1, rng, device)
         self._obs_mean, self._obs_scale = np.zeros(obs_dim), np.ones(obs_dim)
         self._target_mean, self._target_scale = np.zeros(obs_dim + 1), np.ones(obs_dim + 1)
+        self._deviation = np.ones(obs_dim + 1)
         self.held_out_error = float("inf")
         self.termination_error = 0.0
         self.predicts_termination = False
@@ -140,7 +144,7 @@ class Ensemble:
                 predicted.rewards - happened.rewards,
             ]
         )
-        return float(np.sqrt(np.square(difference / self._target_scale).mean()))
+        return float(np.abs(difference / self._deviation).mean())
 
     def fit(
         self, transitions: Transitions, held_out: np.ndarray, max_steps: int, rng: np.random.Generator
@@ -184,7 +188,11 @@ class Ensemble:
 
     def _normalise(self, transitions: Transitions) -> None:
         self._obs_mean, self._obs_scale = _mean_and_scale(transitions.observations)
-        self._target_mean, self._target_scale = _mean_and_scale(_targets(transitions))
+        targets = _targets(transitions)
+        self._target_mean, self._target_scale = _mean_and_scale(targets)
+        deviation = np.abs((targets - self._target_mean) / self._target_scale).mean(axis=0)
+        # A target that never varied is no reason for an error, however large it is relative to nothing.
+        self._deviation = self._target_scale * np.where(deviation > _NO_VARIATION, deviation, 1.0)
 
     def _inputs(self, observations: np.ndarray, actions: np.ndarray) -> th.Tensor:
         inputs = np.concatenate([(observations - self._obs_mean) / self._obs_scale, actions], axis=-1)
@@ -229,8 +237,7 @@ def _targets(transitions: Transitions) -> np.ndarray:
 def _mean_and_scale(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean and standard deviation of every column; 1 where it does not vary."""
     mean, deviation = values.mean(axis=0, dtype=np.float64), values.std(axis=0, dtype=np.float64)
-    # What is left of a constant after rounding is no variation.
-    return mean, np.where(deviation > 1e-6 * (1e-6 + np.abs(mean)), deviation, 1.0)
+    return mean, np.where(deviation > _NO_VARIATION * (_NO_VARIATION + np.abs(mean)), deviation, 1.0)
 
 
 def _spaced(rows: np.ndarray, most: int) -> np.ndarray:

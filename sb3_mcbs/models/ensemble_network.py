@@ -9,7 +9,7 @@ import torch as th
 from torch.nn import functional
 
 #: Neurons of the hidden layers of every member.
-HIDDEN = (200, 200, 200)
+HIDDEN = (200, 200)
 #: Between them lie the logarithms of the variances, in units of the normalised targets.
 LOG_VARIANCES = (-10.0, 1.0)
 
