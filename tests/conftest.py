@@ -14,6 +14,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_mcbs import MCBS, MCBSDDPG, MCBSSAC, MCBSTD3, MCBSTQC, SnapshotEnvWrapper
+from sb3_mcbs.algorithms import learned_model
 from sb3_mcbs.models import ensemble, ensemble_network
 
 # Small networks are fastest on one thread, and idle OpenMP threads would take cores from the simulations.
@@ -68,6 +69,7 @@ def small_ensembles() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ensemble_network, "HIDDEN", (24, 24))
         patch.setattr(ensemble, "BATCH_SIZE", 64)
+        patch.setattr(learned_model, "LEAST_TRANSITIONS", 100)
         yield
 
 

@@ -19,7 +19,7 @@ def linear_step(observations: np.ndarray, actions: np.ndarray) -> tuple[np.ndarr
 
 
 class LinearEnv(gym.Env):
-    """The system as an environment. It holds a generator in the middle of its work, which no snapshot can capture.
+    """The system as an environment. It holds a generator at work, which no snapshot can capture.
 
     :param limit: it terminates where the first entry is above.
     :param length: steps of an episode; then it is truncated.

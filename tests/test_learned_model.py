@@ -31,11 +31,11 @@ pytestmark = pytest.mark.usefixtures("small_ensembles")
 
 LEARNS = dict(
     forward_model="ensemble",
-    learning_starts=500,
+    learning_starts=100,
     ensemble_size=2,
-    ensemble_train_freq=20,
-    ensemble_gradient_steps=100,
-    ensemble_max_error=0.6,
+    ensemble_train_freq=30,
+    ensemble_gradient_steps=60,
+    ensemble_max_error=0.8,
 )
 NOISE = NormalActionNoise(np.zeros(1), 0.3 * np.ones(1))
 
@@ -64,21 +64,19 @@ def learning_agent(make_agent):
 
 
 def test_the_environment_cannot_be_captured():
-    env = SnapshotEnvWrapper(LinearEnv())
-    env.reset(seed=0)
     with pytest.raises(SnapshotUnsupportedError, match="real_robot"):
-        env.snapshot()
+        SnapshotEnvWrapper(LinearEnv())
 
 
 @pytest.mark.parametrize("cls", SEARCHING)
 def test_agents_search_without_snapshots(learning_agent, no_snapshots, cls):
     agent = learning_agent(cls=cls, action_noise=deepcopy(NOISE))
     assert "learned ensemble of 2 networks" in agent._searcher.description
-    agent.learn(560, log_interval=1000)
+    agent.learn(160, log_interval=1000)
     logged = agent.logger.name_to_value
-    assert logged["search/model_ready"] == 1 and logged["model/held_out_error"] < 0.6
-    assert logged["search/model_error"] < 0.6 and logged["model/termination_error"] == 0
-    # The first fit is after step 501: the actions of the 59 steps after it are searched.
+    assert logged["search/model_ready"] == 1 and logged["model/held_out_error"] < 0.8
+    assert logged["search/model_error"] < 0.8 and logged["model/termination_error"] == 0
+    # The first fit is after step 101: the actions of the 59 steps after it are searched.
     assert agent.n_decisions == 59 and agent.n_simulated_steps == 59 * (3 + 6)
     policy = SearchPolicy(agent, agent.env, seed=0, n_simulations=1)
     evaluate_policy(policy, agent.env, 1)
@@ -90,9 +88,9 @@ def test_it_changes_nothing_until_it_is_used(learning_agent, make_agent, cls, pl
     never = dict(ensemble_max_error=0.0, ensemble_gradient_steps=3)
     faithful = dict(fast_update=False) if cls is MCBSTD3 else {}
     noise = dict(action_noise=deepcopy(NOISE)) if cls is MCBSTD3 else {}
-    ours = learning_agent(cls=cls, **never, **faithful, **deepcopy(noise)).learn(560)
-    theirs = make_agent(linear_vec_env(), cls=plain, learning_starts=500, **deepcopy(noise)).learn(560)
-    assert ours.learned_model._fitted_at == 541 and ours.n_decisions == 0
+    ours = learning_agent(cls=cls, **never, **faithful, **deepcopy(noise)).learn(160)
+    theirs = make_agent(linear_vec_env(), cls=plain, learning_starts=100, **deepcopy(noise)).learn(160)
+    assert ours.learned_model._fitted_at == 131 and ours.n_decisions == 0
     assert ours.logger.name_to_value.get("search/model_ready", 0) == 0
     assert_same_parameters(ours, theirs)
     for name in ("observations", "actions", "rewards", "dones"):
@@ -101,23 +99,22 @@ def test_it_changes_nothing_until_it_is_used(learning_agent, make_agent, cls, pl
 
 def test_it_is_put_aside_while_its_error_is_too_high(learning_agent):
     agent = learning_agent()
-    agent.learn(540)
+    agent.learn(140)
     assert agent.n_decisions == 39
-    agent.learned_model.ensemble.held_out_error = 0.61
-    agent._model_settings_unchanged = True
+    agent.learned_model.ensemble.held_out_error = 0.81
     assert not agent._searcher.ready
     policy = SearchPolicy(agent, agent.env)
     observation = agent.env.reset()
     actions, _ = policy.predict(observation)
     np.testing.assert_allclose(actions, agent.predict(observation, deterministic=True)[0], rtol=1e-5)
     assert (policy.last_result.chosen, policy.last_result.simulated_steps) == (-1, 0)
-    agent.learned_model.ensemble.held_out_error = 0.59
+    agent.learned_model.ensemble.held_out_error = 0.79
     policy.predict(observation)
     assert policy.last_result.chosen[0] >= 0
 
 
 def test_an_agent_without_noise_explores_until_the_model_is_ready(learning_agent):
-    agent = learning_agent(ensemble_max_error=0.0, beam_noise=0.2).learn(501)
+    agent = learning_agent(ensemble_max_error=0.0, beam_noise=0.2).learn(101)
     assert agent.action_noise._sigma == pytest.approx(0.2)
 
 
@@ -142,21 +139,21 @@ def test_time_limits_are_no_terminations():
 
 
 def test_terminations_reach_the_model_and_time_limits_do_not(learning_agent):
-    agent = learning_agent(linear_vec_env(2, length=5)).learn(560)
+    agent = learning_agent(linear_vec_env(2, length=5)).learn(160)
     assert not agent.learned_model.ensemble.predicts_termination
-    assert agent.replay_buffer.dones.sum() > 100
-    agent = learning_agent(linear_vec_env(2, limit=0.8)).learn(560)
-    assert agent.learned_model.ensemble.predicts_termination and agent.n_decisions > 40
+    assert agent.replay_buffer.dones.sum() > 20
+    agent = learning_agent(linear_vec_env(2, limit=0.8)).learn(160)
+    assert agent.learned_model.ensemble.predicts_termination and agent.n_decisions > 20
 
 
 def test_normalised_environments(learning_agent, no_snapshots):
     env = VecNormalize(VecMonitor(linear_vec_env(2, length=7)), gamma=0.9)
-    agent = learning_agent(env).learn(560)
+    agent = learning_agent(env).learn(160)
     model = agent.learned_model.ensemble
     # In the environment's own units: the first target's mean is that of the raw rewards.
     transitions, held_out = read_transitions(agent.replay_buffer)
     assert model._target_mean[-1] == pytest.approx(transitions.rewards[~held_out].mean(), abs=0.1)
-    assert agent.logger.name_to_value["search/model_error"] < 0.6 and agent.n_decisions > 40
+    assert agent.logger.name_to_value["search/model_error"] < 0.8 and agent.n_decisions > 20
     acting = VecNormalize(linear_vec_env(3), training=False, norm_reward=False)
     acting.obs_rms = env.obs_rms
     policy = SearchPolicy(agent, acting)
@@ -166,11 +163,11 @@ def test_normalised_environments(learning_agent, no_snapshots):
 
 
 def test_environments_that_no_other_model_takes(learning_agent, no_snapshots):
-    agent = learning_agent(linear_vec_env(2, SubprocVecEnv)).learn(530)
-    assert agent.n_decisions > 10
+    agent = learning_agent(linear_vec_env(2, SubprocVecEnv)).learn(130)
+    assert agent.n_decisions > 0
     agent.env.close()
-    agent = learning_agent(VecFrameStack(linear_vec_env(), 3)).learn(530)
-    assert agent.n_decisions > 10
+    agent = learning_agent(VecFrameStack(linear_vec_env(), 3)).learn(130)
+    assert agent.n_decisions > 0
 
 
 @pytest.mark.parametrize(
@@ -183,12 +180,12 @@ def test_environments_that_no_other_model_takes(learning_agent, no_snapshots):
     ],
 )
 def test_other_searches(learning_agent, settings):
-    agent = learning_agent(linear_vec_env(2), **settings).learn(540)
+    agent = learning_agent(linear_vec_env(2), **settings).learn(140)
     assert 0 < agent.n_decisions <= 40
 
 
 def test_saved_and_loaded(learning_agent, tmp_path):
-    agent = learning_agent().learn(540)
+    agent = learning_agent().learn(140)
     agent.save(tmp_path / "agent")
     env = linear_vec_env()
     loaded = MCBSTD3.load(tmp_path / "agent", env=env, device="cpu")
@@ -196,15 +193,11 @@ def test_saved_and_loaded(learning_agent, tmp_path):
     actions = [SearchPolicy(each, env, seed=3).predict(observation)[0] for each in (agent, loaded)]
     np.testing.assert_array_equal(*actions)
     assert loaded.learned_model.ensemble.held_out_error == agent.learned_model.ensemble.held_out_error
-    loaded.learn(540, reset_num_timesteps=False)
+    loaded.learn(140, reset_num_timesteps=False)
     assert loaded.n_decisions > agent.n_decisions
     with pytest.raises(ValueError, match="ensemble_size is 3, and this agent has learned a model of 2"):
         MCBSTD3.load(tmp_path / "agent", ensemble_size=3, device="cpu")
-    other = (
-        MCBSTD3.load(tmp_path / "agent", env=snapshot_vec_env("Pendulum-v1"), forward_model="auto")
-        if 0
-        else (MCBSTD3.load(tmp_path / "agent", forward_model="auto", device="cpu"))
-    )
+    other = MCBSTD3.load(tmp_path / "agent", forward_model="auto", device="cpu")
     assert other.learned_model is None
     read = load_agent(tmp_path / "agent.zip", env)
     with pytest.raises(ValueError, match="load_agent reads no learned model"):
@@ -217,21 +210,21 @@ def test_agents_without_a_learned_model(make_agent, tmp_path):
         SearchPolicy(plain, plain.env, forward_model="ensemble")
     plain.save(tmp_path / "plain")
     loaded = MCBSTD3.load(tmp_path / "plain", env=linear_vec_env(), **LEARNS)
-    loaded.learn(520)
+    loaded.learn(120)
     assert loaded.n_decisions > 0
 
 
-@pytest.mark.parametrize("n_envs, crash_at", [(1, 545), (2, 530)])
+@pytest.mark.parametrize("n_envs, crash_at", [(1, 145), (2, 130)])
 def test_a_resumed_run_is_exact(make_agent, tmp_path, n_envs, crash_at):
     def make_env(folder):
         return snapshot_vec_env("Pendulum-v1", n_envs)
 
     def make(folder):
         return make_agent(
-            make_env(folder), **{**LEARNS, "ensemble_max_error": 0.9}, action_noise=deepcopy(NOISE)
+            make_env(folder), **{**LEARNS, "ensemble_max_error": 1.5}, action_noise=deepcopy(NOISE)
         )
 
-    whole, resumed = assert_resumed_is_exact(make, tmp_path, 600, crash_at, make_env=make_env)
+    whole, resumed = assert_resumed_is_exact(make, tmp_path, 200, crash_at, make_env=make_env)
     assert whole.n_decisions == resumed.n_decisions > 0
     ours, theirs = whole.learned_model, resumed.learned_model
     assert ours.rng.bit_generator.state == theirs.rng.bit_generator.state
