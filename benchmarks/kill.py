@@ -4,6 +4,8 @@ Every second SIGKILL hits while a checkpoint is being written, the others at ran
 """
 
 import argparse
+import itertools
+import json
 import os
 import signal
 import subprocess
@@ -15,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.common import print_table, write
-from benchmarks.kill_run import CASES, RESULT, STARTED
+from benchmarks.common import RESULTS, print_table, write
+from benchmarks.kill_run import ALGORITHMS, CASES, RESULT, STARTED
 
 STEPS = {"HalfCheetah-v5": 4000, "Ant-v5": 3000, "Walker2d-v5": 6000, "Pendulum-v1": 5000}
 
@@ -147,29 +149,31 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--cases", nargs="+", default=list(STEPS), choices=STEPS)
-    parser.add_argument("--algorithm", default="mcbs_td3")
+    parser.add_argument("--algorithms", nargs="+", default=["mcbs_td3"], choices=ALGORITHMS)
     parser.add_argument("--save-freq", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--folder", type=Path, help="keep the runs here")
     arguments = parser.parse_args()
     folder = arguments.folder or Path(tempfile.mkdtemp(prefix="sb3-mcbs-kill-"))
     rows = []
-    for case in arguments.cases:
+    for algorithm, case in itertools.product(arguments.algorithms, arguments.cases):
         rows.append(
             measure(
-                arguments.algorithm,
-                case,
-                folder,
-                STEPS[case],
-                arguments.save_freq,
-                arguments.kills,
-                arguments.seed,
+                algorithm, case, folder, STEPS[case], arguments.save_freq, arguments.kills, arguments.seed
             )
         )
         print(rows[-1], flush=True)
     header = [name for name in rows[0] if name != "names"]
     print_table(header, [[row[name] for name in header] for row in rows])
-    write("kill", rows)
+    write("kill", [*_others(rows), *rows])
+
+
+def _others(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """What was measured before of other algorithms and environments."""
+    path = RESULTS / "kill.json"
+    before = json.loads(path.read_text())["results"] if path.exists() else []
+    known = {(row["algorithm"], row["environment"]) for row in rows}
+    return [row for row in before if (row["algorithm"], row["environment"]) not in known]
 
 
 if __name__ == "__main__":

@@ -44,6 +44,17 @@ CASES = {
 }
 ALGORITHMS: dict[str, tuple[type[OffPolicyAlgorithm], dict[str, Any]]] = {
     "mcbs_td3": (MCBSTD3, {"n_threads": 1}),
+    "mcbs_td3 with schedules": (
+        MCBSTD3,
+        {
+            "n_threads": 1,
+            "search_schedule": "saturation",
+            "search_unit": "episode",
+            "search_share": 0.7,
+            "saturation_window": 1000,
+            "rollout_replay": 0.25,
+        },
+    ),
     "td3": (TD3, {}),
     "sac": (SAC, {}),
     "td3_one_rollout": (TD3, {"train_freq": 1_000_000}),

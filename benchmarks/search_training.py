@@ -79,7 +79,8 @@ class Evaluation(BaseCallback):
                 "step": self.num_timesteps,
                 "training": float(np.mean(self._returns[-10:])),
                 **returns,
-                "simulated_steps": getattr(agent, "n_simulated_steps", 0),
+                "simulated_steps": getattr(agent, "n_simulated_steps", 0)
+                + getattr(agent, "n_learning_steps", 0),
                 "training_seconds": now - self._start - self._evaluating,
             }
         )
@@ -126,7 +127,8 @@ def main() -> None:
     th.set_num_threads(1)
     args.folder.mkdir(parents=True, exist_ok=True)
     path = args.folder / f"{args.env}-{args.arm}-{args.seed}.json"
-    record = {"arm": args.arm, "env": args.env, "seed": args.seed, "machine": machine(), "evaluations": []}
+    record = {"arm": args.arm, "env": args.env, "seed": args.seed, "steps": args.steps}
+    record |= {"machine": machine(), "evaluations": []}
     agent = make_agent(args.arm, args.env, args.seed)
     agent.learn(args.steps, callback=Evaluation(args.evaluate_at, args.env, path, record))
 

@@ -4,15 +4,8 @@ from typing import Any
 
 from stable_baselines3 import TD3
 
+from benchmarks.search_training_agents import PlainTD3, PlanningTD3
 from sb3_mcbs import MCBSTD3
-from sb3_mcbs.algorithms.td3_update import FastUpdate
-
-
-class PlainTD3(FastUpdate):
-    """SB3's TD3 with this package's gradient step, which is the same but for rounding."""
-
-    fast_update = True
-
 
 ALGORITHM_1: dict[str, Any] = {
     "beam_width": 6,
@@ -22,7 +15,31 @@ ALGORITHM_1: dict[str, Any] = {
     "n_threads": 1,
 }
 
+#: The search of the preset "efficient": 18 simulated steps per decision, no noise after the first action.
+EFFICIENT: dict[str, Any] = {
+    **ALGORITHM_1,
+    "n_simulations": 1,
+    "rollout_noise": 0.0,
+    "include_policy_action": True,
+}
+HALF: dict[str, Any] = {"search_share": 0.5, "search_unit": "episode"}
+ON_TOP: dict[str, Any] = {"action_noise_after_search": True}
+
 ARMS: dict[str, tuple[type[TD3], dict[str, Any]]] = {
     "td3": (PlainTD3, {}),
+    "td3_n3": (PlainTD3, {"n_steps": 3}),
     "algorithm1": (MCBSTD3, ALGORITHM_1),
+    "efficient": (MCBSTD3, EFFICIENT),
+    "half": (MCBSTD3, EFFICIENT | HALF),
+    "half_steps": (MCBSTD3, EFFICIENT | {"search_share": 0.5}),
+    "anneal": (MCBSTD3, EFFICIENT | {"search_schedule": "anneal", "final_search_share": 0.0}),
+    "half_noise": (MCBSTD3, EFFICIENT | HALF | ON_TOP),
+    "half_n3": (MCBSTD3, EFFICIENT | HALF | {"n_steps": 3}),
+    "half_replay": (MCBSTD3, EFFICIENT | HALF | {"rollout_replay": 0.5}),
+    "half_replay25": (MCBSTD3, EFFICIENT | HALF | {"rollout_replay": 0.25}),
+    "half_noise_replay25": (MCBSTD3, EFFICIENT | HALF | ON_TOP | {"rollout_replay": 0.25}),
+    "replay25": (MCBSTD3, EFFICIENT | {"search_share": 0.0, "rollout_replay": 0.25}),
+    "half_imitation": (PlanningTD3, EFFICIENT | HALF | {"imitation": 0.1, "replan": True}),
+    "half_expansion": (PlanningTD3, EFFICIENT | HALF | {"expansion": 3}),
+    "expansion": (PlanningTD3, EFFICIENT | {"search_share": 0.0, "expansion": 3}),
 }

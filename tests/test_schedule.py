@@ -178,7 +178,7 @@ def test_streams_do_not_depend_on_the_schedule(make_agent):
         )
         agent.learn(24)  # the first step after 20 random ones
         first_unsearched[share] = agent.replay_buffer.actions[5]
-        searched = agent._searched
+        searched = [] if agent._decision is None else list(agent._decision[1])
     kept = [env for env in range(4) if env not in searched]
     assert searched and kept, "some of each"
     same = first_unsearched[0.0] == first_unsearched[0.5]

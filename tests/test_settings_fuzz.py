@@ -117,7 +117,10 @@ def test_settings_are_refused_or_search_a_small_world(kwargs: dict[str, Any]) ->
     if found.time_budget is None:
         memory, moments = PlanMemory(2, found.rollout_depth, 1), [(0, 0), (0, 0)]
         shape = (2, 1)
-        result = search(Decision(LineWorld(), roots, observations, agent, found, shape, rng, memory, moments))
+        decision = Decision(
+            LineWorld(), roots, observations, agent, found, shape, rng, memory, range(2), moments
+        )
+        result = search(decision)
     else:
         pace = Pace()
         deadline = pace.clock() + min(found.time_budget, 0.01)

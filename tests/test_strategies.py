@@ -40,7 +40,8 @@ def on_line(model, settings, seed=0, roots=ROOTS, rng=None):
     memory, moments = PlanMemory(len(roots), settings.rollout_depth, 1), [(1, 0)] * len(roots)
     rng = rng or np.random.default_rng(seed)
     shape = (len(roots), 1)
-    return search(Decision(model, roots, observations, AGENT, settings, shape, rng, memory, moments))
+    envs = range(len(roots))
+    return search(Decision(model, roots, observations, AGENT, settings, shape, rng, memory, envs, moments))
 
 
 def tree_of(reference: Reference, settings: SearchSettings) -> ReferenceTree:
@@ -332,5 +333,5 @@ def test_dynamics_that_turn_out_to_be_random_end_a_search_of_single_simulations(
     actions, _ = policy.predict(env.reset())
     observations, rewards, _, infos = env.step(actions)
     with pytest.warns(UserWarning, match="random"), pytest.raises(ValueError, match="luckiest"):
-        policy.searcher.model_error(policy.last_result, observations + 1, rewards, infos)
+        policy.searcher.model_error(policy.last_result, [0], observations + 1, rewards, infos)
     policy.close()

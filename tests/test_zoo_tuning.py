@@ -77,6 +77,29 @@ def test_everything_is_tuned_of_agents_with_quantiles_or_entropy(
     assert base == "sac" or (agent.critic.n_quantiles, agent.top_quantiles_to_drop_per_net) == (9, 3)
 
 
+@pytest.mark.parametrize("schedule", ["constant", "saturation", "anneal"])
+def test_schedules_are_tuned_when_asked(
+    schedule: str, make_agent: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(sampler.SWITCH, "schedules")
+    drawn = {
+        "search_schedule": schedule,
+        "search_share": 0.5,
+        "search_unit": "episode",
+        "rollout_replay": 0.25,
+    }
+    params = {**SEARCH, **drawn, "final_share_factor": 0.2}
+    if schedule == "constant":
+        del params["final_share_factor"]
+    sampled = sample(params)
+    assert sampled == sampler.convert_mcbs_params(params)
+    assert sampled.get("final_search_share") == (None if schedule == "constant" else 0.1)
+    agent = make_agent(**sampled)
+    assert {name: getattr(agent, name) for name in sampled} == sampled
+    with pytest.raises(optuna.TrialPruned, match="rollout_replay needs a rollout_depth"):
+        sample({**params, "rollout_depth": 0, "n_simulations": 1})
+
+
 def test_strategies_are_tuned_when_asked(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(sampler.SWITCH, "strategies")
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
@@ -97,7 +120,9 @@ def test_strategies_are_tuned_when_asked(monkeypatch: pytest.MonkeyPatch) -> Non
 
 def test_unknown_scope_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(sampler.SWITCH, "td3")
-    with pytest.raises(ValueError, match="SB3_MCBS_TUNE must be one of search, strategies, all, got 'td3'"):
+    with pytest.raises(
+        ValueError, match="SB3_MCBS_TUNE must be one of search, strategies, schedules, all, got 'td3'"
+    ):
         sample(SEARCH)
 
 

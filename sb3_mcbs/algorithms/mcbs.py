@@ -174,7 +174,12 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         self._decision = self._rollouts = None
         # For all environments whatever is searched, so that random streams do not depend on the schedule.
         noise = None if action_noise is None else DrawnNoise(action_noise)
-        actions, scaled_actions = super()._sample_action(learning_starts, noise, n_envs)
+        try:
+            actions, scaled_actions = super()._sample_action(learning_starts, noise, n_envs)
+        except ValueError:  # of torch: a stochastic actor cannot sample where its mean is NaN
+            assert self._searcher is not None and self._last_obs is not None
+            self._searcher.check_networks(self._last_obs)
+            raise
         if self.num_timesteps < learning_starts:
             return actions, scaled_actions
         assert self._schedule is not None and self._searcher is not None

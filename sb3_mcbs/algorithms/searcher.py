@@ -2,7 +2,7 @@
 
 import logging
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -147,8 +147,16 @@ class Searcher:
                     self.model, roots, observations, agent, settings, deadline, self._pace, rng
                 )
         if result.invalid_rollouts or not is_finite(result.actions):
-            _check_networks(agent, observations)
+            _check_networks(agent.policy, agent.value, observations)
         return self._as_replay_buffers_keep_them(result) if record else result
+
+    def check_networks(self, observations: Observations) -> None:
+        """Find out whether the networks have diverged.
+
+        :param observations: ``[n_envs, *]``, as the agent got them.
+        :raises NonFiniteError: if it is the networks, or the observations, that are not finite.
+        """
+        _check_networks(policy_function(self.agent), value_function(self.agent), observations)
 
     def _as_replay_buffers_keep_them(self, result: SearchResult) -> SearchResult:
         assert result.rollouts is not None
@@ -335,17 +343,23 @@ class Searcher:
         warnings.warn(message, stacklevel=4)
 
 
-def _check_networks(agent: Agent, observations: Observations) -> None:
+def _check_networks(
+    policy: Callable[[Observations], np.ndarray],
+    value: Callable[[Observations, np.ndarray], np.ndarray],
+    observations: Observations,
+) -> None:
     """Tell networks that diverged from rollouts that did.
 
+    :param policy: the actor.
+    :param value: the critics.
     :param observations: ``[n_envs, *]``, present observations.
     :raises NonFiniteError: if it is the networks, or the environments.
     """
     check_observations(observations)
-    actions = agent.policy(observations)
+    actions = policy(observations)
     if not is_finite(actions):
         answer = "The actor answers"
-    elif not is_finite(agent.value(observations, actions)):
+    elif not is_finite(value(observations, actions)):
         answer = "The critics answer"
     else:
         return

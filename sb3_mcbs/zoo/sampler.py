@@ -3,7 +3,8 @@ What ``-optimize`` draws for our algorithms, and how a trial's parameters become
 
 By default only the size and noise of the search are tuned and the other settings of the hyperparameter file
 are held, so that trials differ in one thing. ``SB3_MCBS_TUNE=strategies`` tunes how it searches as well,
-``SB3_MCBS_TUNE=all`` what RL Zoo tunes of the algorithm without search.
+``SB3_MCBS_TUNE=schedules`` when it searches and what is learned from it, ``SB3_MCBS_TUNE=all`` what RL Zoo
+tunes of the algorithm without search.
 """
 
 import os
@@ -11,10 +12,14 @@ from typing import Any
 
 import optuna
 
-from sb3_mcbs.search import SearchSettings
+from sb3_mcbs.algorithms.keywords import SETTINGS
+from sb3_mcbs.algorithms.rollout_replay import RolloutReplaySettings
+from sb3_mcbs.search import ScheduleSettings, SearchSettings
+from sb3_mcbs.search.checks import CheckedSettings
+from sb3_mcbs.search.schedule import SCHEDULES, UNITS
 
 SWITCH = "SB3_MCBS_TUNE"
-SCOPES = ("search", "strategies", "all")
+SCOPES = ("search", "strategies", "schedules", "all")
 
 BEAM_WIDTHS = (3, 6, 12, 18)
 ROLLOUT_DEPTHS = (0, 1, 2, 3, 4, 6)
@@ -24,12 +29,16 @@ STRATEGIES = ("beam", "tree", "refine")
 PROPOSAL_FACTORS = (1, 4, 8)
 BRANCHING = (2, 3, 5)
 N_ROUNDS = (2, 3, 4)
+SEARCH_SHARES = (0.25, 0.5, 1.0)
+#: As parts of ``search_share``.
+FINAL_SEARCH_SHARES = (0.0, 0.2, 0.5)
+ROLLOUT_REPLAY = (0.0, 0.25, 0.5)
 
 #: A trial whose decisions cost more simulated steps than this would take days.
 MAX_SIMULATED_STEPS = 600
 
 #: What trials store of a strategy under names that are no settings themselves.
-_HELPERS = ("proposal_factor", "noise_free_rollouts")
+_HELPERS = ("proposal_factor", "noise_free_rollouts", "final_share_factor")
 
 
 def tuning_scope() -> str:
@@ -66,6 +75,8 @@ def sample_mcbs_params(
     }
     if scope == "strategies":
         sampled |= _sample_strategy(trial)
+    if scope == "schedules":
+        sampled |= _sample_schedule(trial)
     params = _search_settings(sampled)
     reason = _why_senseless(params, sampled)
     if reason is not None:
@@ -97,6 +108,19 @@ def _sample_strategy(trial: optuna.Trial) -> dict[str, Any]:
     return sampled
 
 
+def _sample_schedule(trial: optuna.Trial) -> dict[str, Any]:
+    """Draw when to search and what to learn from it, by the names that the trial stores."""
+    sampled: dict[str, Any] = {
+        "search_schedule": trial.suggest_categorical("search_schedule", SCHEDULES),
+        "search_share": trial.suggest_categorical("search_share", SEARCH_SHARES),
+        "search_unit": trial.suggest_categorical("search_unit", UNITS),
+        "rollout_replay": trial.suggest_categorical("rollout_replay", ROLLOUT_REPLAY),
+    }
+    if sampled["search_schedule"] != "constant":
+        sampled["final_share_factor"] = trial.suggest_categorical("final_share_factor", FINAL_SEARCH_SHARES)
+    return sampled
+
+
 def _search_settings(sampled: dict[str, Any]) -> dict[str, Any]:
     """Turn what a trial stores of the search into settings."""
     settings = {name: value for name, value in sampled.items() if name not in _HELPERS}
@@ -107,6 +131,8 @@ def _search_settings(sampled: dict[str, Any]) -> dict[str, Any]:
     if sampled.get("proposal_factor", 1) > 1:
         n_kept = settings["beam_width"] * settings.get("branching", 1)
         settings["n_proposals"] = sampled["proposal_factor"] * n_kept
+    if "final_share_factor" in sampled:
+        settings["final_search_share"] = sampled["final_share_factor"] * settings["search_share"]
     return settings
 
 
@@ -116,12 +142,18 @@ def _why_senseless(params: dict[str, Any], sampled: dict[str, Any]) -> str | Non
     if sampled["n_simulations"] > 1 and (params["n_simulations"] == 1 or params.get("rollout_noise") == 0):
         return "n_simulations above 1 needs a beam with noise in its rollouts, else it repeats another trial"
     try:
-        settings = SearchSettings(**params)
+        settings = SearchSettings(**_of(params, SearchSettings))
+        ScheduleSettings(**_of(params, ScheduleSettings)).check_search(settings)
+        RolloutReplaySettings(**_of(params, RolloutReplaySettings)).check_search(settings)
     except ValueError as error:
         return str(error)
     if settings.simulated_steps(deterministic=False) > MAX_SIMULATED_STEPS:
         return f"a decision would simulate more than {MAX_SIMULATED_STEPS} steps"
     return None
+
+
+def _of(params: dict[str, Any], settings: type[CheckedSettings]) -> dict[str, Any]:
+    return {name: value for name, value in params.items() if name in settings.names()}
 
 
 def convert_mcbs_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
@@ -131,7 +163,7 @@ def convert_mcbs_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     :param sampled_params: ``trial.params``
     :return: constructor arguments, as the sampler returned them
     """
-    search_names = {*SearchSettings.names(), *_HELPERS}
+    search_names = {*_HELPERS, *(name for settings in SETTINGS for name in settings.names())}
     search = _search_settings({name: v for name, v in sampled_params.items() if name in search_names})
     others = {name: value for name, value in sampled_params.items() if name not in search_names}
     if not others:

@@ -1,0 +1,185 @@
+"""Agents that are tried in ``benchmarks.search_training`` and are not part of the package."""
+
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_mcbs import MCBSTD3
+from sb3_mcbs.algorithms.td3_update import FastUpdate, TD3Update, _adam_step, _pairs
+from sb3_mcbs.search import search
+from sb3_mcbs.search.strategies import Decision
+
+#: Lazy re-planning: so many states, once in so many updates of the critics.
+REPLANNED, REPLAN_EVERY = 20, 10
+
+
+class PlainTD3(FastUpdate):
+    """SB3's TD3 with this package's gradient step, which is the same but for rounding."""
+
+    fast_update = True
+
+
+class RowsReplayBuffer(ReplayBuffer):
+    """A replay buffer of one environment that remembers which rows were sampled, and keeps more of each.
+
+    :ivar rows: of the last batch.
+    :ivar roots: of the forward model, the state before the step.
+    :ivar plans: ``[rows, act_dim]``, the action that a search found.
+    :ivar is_planned: ``[rows]``.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.rows = np.zeros(0, dtype=int)
+        self.roots: list[Any] = [None] * self.buffer_size
+        self.plans = np.zeros((self.buffer_size, self.action_dim), dtype=np.float32)
+        self.is_planned = np.zeros(self.buffer_size, dtype=bool)
+
+    def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> ReplayBufferSamples:
+        self.rows = batch_inds
+        return super()._get_samples(batch_inds, env)
+
+
+class PlanningTD3(MCBSTD3):
+    """MCBS-TD3 in one environment without normalisation that learns from stored states.
+
+    :param imitation: weight of the squared distance between the actor's action and the searched one, at
+        searched transitions, in units of the critics' mean absolute value.
+    :param replan: whether old searched actions are planned again, a few at a time.
+    :param expansion: steps of the present target actor, from the stored state, in the critics' targets;
+        the first is the stored action. 1: as TD3.
+    :param expanded_share: of a batch.
+    """
+
+    def __init__(
+        self,
+        *args: Any,
+        imitation: float = 0.0,
+        replan: bool = False,
+        expansion: int = 1,
+        expanded_share: float = 0.5,
+        **kwargs: Any,
+    ) -> None:
+        self.imitation, self.replan = imitation, replan
+        self.expansion, self.expanded_share = expansion, expanded_share
+        self.n_learning_steps = 0
+        super().__init__(*args, **{"replay_buffer_class": RowsReplayBuffer, **kwargs})
+
+    def _make_update(self) -> TD3Update:
+        return PlanningUpdate(self)
+
+    def _sample_action(self, *args: Any, **kwargs: Any) -> tuple[np.ndarray, np.ndarray]:
+        assert self._searcher is not None
+        self._root = self._searcher._read_roots([0])[0]
+        return super()._sample_action(*args, **kwargs)
+
+    def _store_transition(self, replay_buffer: ReplayBuffer, *args: Any, **kwargs: Any) -> None:
+        assert isinstance(replay_buffer, RowsReplayBuffer)
+        row = replay_buffer.pos
+        replay_buffer.roots[row] = self._root
+        replay_buffer.is_planned[row] = self._decision is not None
+        if self._decision is not None:
+            replay_buffer.plans[row] = self._decision[0].actions[0]
+        super()._store_transition(replay_buffer, *args, **kwargs)
+
+
+class PlanningUpdate(TD3Update):
+    """TD3's gradient step with what :class:`PlanningTD3` adds.
+
+    :param agent: the agent.
+    """
+
+    _agent: PlanningTD3
+
+    @property
+    def _buffer(self) -> RowsReplayBuffer:
+        assert isinstance(self._agent.replay_buffer, RowsReplayBuffer)
+        return self._agent.replay_buffer
+
+    def _targets(self, data: ReplayBufferSamples) -> th.Tensor:
+        targets = super()._targets(data)
+        if self._agent.expansion > 1:
+            n = round(self._agent.expanded_share * targets.shape[1])
+            targets[0, :n] = th.as_tensor(self._expanded(data.actions[:n].numpy()), dtype=th.float32)
+        if self._agent.replan and self._agent._n_updates % REPLAN_EVERY == 0:
+            self._plan_again()
+        return targets
+
+    def _expanded(self, actions: np.ndarray) -> np.ndarray:
+        """Simulate stored actions, and then what the target actor does.
+
+        :param actions: ``[n, act_dim]``, of the first rows of the batch.
+        :return: ``[n]`` targets.
+        """
+        agent, searcher = self._agent, self._agent._searcher
+        assert searcher is not None and searcher.model is not None and agent.search_rng is not None
+        n = len(actions)
+        roots = [self._buffer.roots[row] for row in self._buffer.rows[:n]]
+        searcher.model.set_roots(roots, np.arange(n), agent.search_rng)
+        targets, discount, alive = np.zeros(n), 1.0, np.ones(n, dtype=bool)
+        for _ in range(agent.expansion):
+            step = searcher.model.step(searcher.unscale(actions))
+            agent.n_learning_steps += n
+            targets += np.where(alive, discount * step.rewards, 0.0)
+            alive &= ~step.terminated
+            discount *= agent.gamma
+            observations = th.as_tensor(np.asarray(step.observations), dtype=th.float32)
+            actions = self._actor_target(observations.t()).t().numpy()
+        noise = th.empty(actions.shape).normal_(0, agent.target_policy_noise)
+        noise.clamp_(-agent.target_noise_clip, agent.target_noise_clip)
+        pairs = _pairs(observations, (th.as_tensor(actions) + noise).clamp_(-1, 1))
+        values = th.cat([critic(pairs) for critic in self._critic_targets]).amin(dim=0).numpy()
+        return targets + np.where(alive, discount * values, 0.0)
+
+    def _plan_again(self) -> None:
+        agent, searcher, buffer = self._agent, self._agent._searcher, self._buffer
+        assert searcher is not None and agent.search_rng is not None
+        rows = buffer.rows[buffer.is_planned[buffer.rows]][:REPLANNED]
+        if not len(rows):
+            return
+        roots = [buffer.roots[row] for row in rows]
+        shape = (len(rows), buffer.action_dim)
+        observations = buffer.observations[rows, 0]
+        decision = Decision(
+            searcher.model,
+            roots,
+            observations,
+            searcher.agent_functions(),
+            searcher.settings,
+            shape,
+            agent.search_rng,
+        )
+        result = search(decision)
+        agent.n_learning_steps += result.simulated_steps
+        buffer.plans[rows] = result.actions
+
+    def _update_actor(self, pairs: th.Tensor) -> float:
+        """One step of the actor up the first critic, held towards searched actions.
+
+        :param pairs: ``[obs_dim + act_dim, batch]``; its actions are overwritten.
+        :return: the loss without the constraint.
+        """
+        if not self._agent.imitation:
+            return super()._update_actor(pairs)
+        first_critic = self._critics[0]
+        n_obs = len(pairs) - get_action_dim(self._agent.action_space)
+        observations = pairs[:n_obs]
+        actor_outputs = self._actor.outputs(observations)
+        pairs[n_obs:] = actor_outputs[-1]
+        outputs = first_critic.outputs(pairs)
+        values = outputs[-1]
+        gradient = th.full_like(values, -1 / values.numel())
+        gradient = first_critic.backward(pairs, outputs, gradient, of_parameters=False)[n_obs:]
+        rows = self._buffer.rows
+        is_planned = th.as_tensor(self._buffer.is_planned[rows], dtype=th.float32)
+        away = actor_outputs[-1] - th.as_tensor(self._buffer.plans[rows]).t()
+        weight = self._agent.imitation * values.abs().mean() / values.numel()
+        gradient = gradient + 2 * weight * is_planned * away
+        self._actor.backward(observations, actor_outputs, gradient, of_parameters=True)
+        _adam_step(self._agent.actor.optimizer)
+        return float(-values.mean())
