@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
+from sb3_contrib import TQC
 from stable_baselines3 import SAC, TD3
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -16,7 +17,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecNormalize
 
 from benchmarks.common import NETWORKS
-from sb3_mcbs import MCBSTD3, SnapshotEnvWrapper
+from sb3_mcbs import MCBSDDPG, MCBSSAC, MCBSTD3, MCBSTQC, SnapshotEnvWrapper
 from sb3_mcbs.checkpoints import ExactCheckpointCallback, resume
 
 
@@ -44,6 +45,9 @@ CASES = {
 }
 ALGORITHMS: dict[str, tuple[type[OffPolicyAlgorithm], dict[str, Any]]] = {
     "mcbs_td3": (MCBSTD3, {"n_threads": 1}),
+    "mcbs_ddpg": (MCBSDDPG, {"n_threads": 1, "rollout_replay": 0.25}),
+    "mcbs_sac": (MCBSSAC, {"n_threads": 1, "use_sde": True, "entropy_bonus": True, "search_share": 0.5}),
+    "mcbs_tqc": (MCBSTQC, {"n_threads": 1, "preset": "balanced", "tqc_value": "truncated"}),
     "mcbs_td3 with schedules": (
         MCBSTD3,
         {
@@ -165,6 +169,8 @@ def ending(agent: OffPolicyAlgorithm, folder: Path) -> dict[str, np.ndarray]:
     for part in ("actor", "critic"):
         for index, state in getattr(agent, part).optimizer.state_dict()["state"].items():
             result |= {f"{part} optimizer {index} {name}": _digest(value) for name, value in state.items()}
+    if isinstance(agent, SAC | TQC) and agent.log_ent_coef is not None:
+        result["logarithm of the entropy coefficient"] = _digest(agent.log_ent_coef.detach())
     assert agent.replay_buffer is not None
     for name, value in vars(agent.replay_buffer).items():
         if isinstance(value, np.ndarray):

@@ -33,6 +33,10 @@ ARMS: dict[str, tuple[type[TD3], dict[str, Any]]] = {
     "half": (MCBSTD3, EFFICIENT | HALF),
     "half_steps": (MCBSTD3, EFFICIENT | {"search_share": 0.5}),
     "anneal": (MCBSTD3, EFFICIENT | {"search_schedule": "anneal", "final_search_share": 0.0}),
+    "anneal_episodes": (
+        MCBSTD3,
+        EFFICIENT | {"search_schedule": "anneal", "final_search_share": 0.0, "search_unit": "episode"},
+    ),
     "half_noise": (MCBSTD3, EFFICIENT | HALF | ON_TOP),
     "half_n3": (MCBSTD3, EFFICIENT | HALF | {"n_steps": 3}),
     "half_replay": (MCBSTD3, EFFICIENT | HALF | {"rollout_replay": 0.5}),

@@ -1,87 +1,230 @@
-"""Returns of a trained agent under every preset and a tree, on the same reset seeds.
+"""Returns of a trained agent against the simulated steps per decision, for every strategy.
 
-The agent's file is read by ``load_agent``. Results are written after every seed, so that all have been run
-with equally many.
+All reset seeds of an arm act side by side in one vectorised environment. Settings are chosen on one set of
+seeds and reported on another:
+
+    python -m benchmarks.strategies sac-HalfCheetah-v3.zip HalfCheetah-v4 --seeds choosing
+    python -m benchmarks.strategies sac-HalfCheetah-v3.zip HalfCheetah-v4 --seeds reporting
+    python -m benchmarks.strategies --table
+
+The second runs what was best of each strategy and budget in the first, and the presets. Arms are named by
+their sizes: beam candidates x depth, tree width x branching x depth, refine width x rounds x depth; (2x3) is
+a depth of 2 macro-steps of 3 steps, "in 2" two directions, "of 48" critic pre-selection, "soft"
+entropy_bonus, "truncated" tqc_value. Arms that the file of results holds already are left out.
 """
 
 import argparse
+import json
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch as th
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from benchmarks.common import print_table, write
-from sb3_mcbs import SearchPolicy, SnapshotEnvWrapper, load_agent
+from benchmarks.common import RESULTS, print_table, write
+from benchmarks.strategies_arms import ARMS, BUDGETS, SLACK, has_value
+from sb3_mcbs import SearchPolicy, SearchSettings, SnapshotEnvWrapper, load_agent
 from sb3_mcbs.search import PRESETS
 
-TREE = {"strategy": "tree", "n_simulations": 1, "one_node_per_root": True, "rollout_noise": 0.05}
-ARMS: dict[str, dict[str, Any] | None] = {"actor alone": None, **PRESETS, "tree": TREE}
+FILE = "strategies"
+FIGURE = RESULTS.parents[1] / "docs" / "images" / "strategies.png"
+SEEDS = {"choosing": range(100, 102), "reporting": range(200, 210)}
+#: On whose choosing seeds the arms that are reported of every agent were chosen.
+CHOSEN_WITH = "sac-HalfCheetah-v3"
 
 
-def run_episode(agent: OffPolicyAlgorithm, env_id: str, seed: int, settings: Any) -> dict[str, float]:
-    """Act for one episode.
+def budget_of(arm: str) -> int | None:
+    """The budget that an arm's simulated steps are about; ``None``: none of them."""
+    steps = SearchSettings(**ARMS[arm]).simulated_steps()
+    near = [budget for budget in BUDGETS if abs(steps - budget) <= SLACK * budget]
+    return near[0] if near else None
+
+
+def run_arm(agent: OffPolicyAlgorithm, env_id: str, seeds: range, settings: dict[str, Any]) -> dict[str, Any]:
+    """Act for one episode from every seed, side by side.
 
     :param agent: the trained agent.
     :param env_id: its environment.
-    :param seed: of the environment's reset and of the search.
-    :param settings: of the search; None acts without.
-    :return: the return, its cost per decision, and how many decisions there were.
+    :param seeds: of the resets; the first is that of the search.
+    :param settings: of the search.
+    :return: returns, and means over all decisions. ``predicted`` is the value of the chosen action,
+        ``realised`` the discounted return that followed, closed by the critics at a time limit.
     """
-    env = make_vec_env(env_id, 1, seed=seed, wrapper_class=SnapshotEnvWrapper)
-    policy: Any = agent if settings is None else SearchPolicy(agent, env, seed=seed, n_threads=1, **settings)
-    observations, totals, done, n_decisions = env.reset(), np.zeros(4), False, 0
-    while not done:
-        start = time.perf_counter()
-        actions, _ = policy.predict(observations, deterministic=True)
-        seconds = time.perf_counter() - start
-        result = getattr(policy, "last_result", None)
-        simulated = 0 if result is None else result.simulated_steps
-        evaluated = 0 if result is None else result.critic_evaluations
-        observations, rewards, dones, _ = env.step(actions)
-        totals += float(rewards[0]), simulated, evaluated, 1000 * seconds
-        done, n_decisions = bool(dones[0]), n_decisions + 1
+    env = make_vec_env(env_id, len(seeds), seed=seeds[0], wrapper_class=SnapshotEnvWrapper)
+    policy = SearchPolicy(agent, env, seed=seeds[0], **{"n_threads": 1, **settings})
+    searcher, functions = policy.searcher, policy.searcher.agent_functions()
+    observations: Any = env.reset()
+    running = list(range(len(seeds)))
+    rewards: list[list[float]] = [[] for _ in seeds]
+    predicted: list[list[float]] = [[] for _ in seeds]
+    closing = np.zeros(len(seeds))
+    simulated = evaluated = invalid = 0
+    seconds = cpu_seconds = 0.0
+    actions = np.zeros_like([env.action_space.sample() for _ in seeds])
+    while running:
+        start, cpu_start = time.perf_counter(), time.process_time()
+        if settings.get("rollout_depth") == 0:
+            result = searcher.search(observations[running], policy.rng)
+        else:
+            result = searcher.search(observations, policy.rng, running)
+        searcher.note_actions(result.actions)
+        seconds += time.perf_counter() - start
+        cpu_seconds += time.process_time() - cpu_start
+        simulated += result.simulated_steps
+        evaluated += result.critic_evaluations
+        invalid += result.invalid_rollouts
+        actions[running] = searcher.unscale(result.actions)
+        observations, received, dones, infos = env.step(actions)
+        for row, index in enumerate(running):
+            rewards[index].append(float(received[index]))
+            predicted[index].append(float(result.values[row, result.chosen[row]]))
+            if dones[index] and infos[index]["TimeLimit.truncated"]:
+                last = infos[index]["terminal_observation"][None]
+                closing[index] = functions.value(last, functions.policy(last))[0]
+        running = [index for index in running if not dones[index]]
+    policy.close()
     env.close()
-    mean = totals[1:] / n_decisions
+    realised = [discounted(*episode, agent.gamma) for episode in zip(rewards, closing, strict=True)]
+    decisions = sum(map(len, rewards))
+    errors = [np.mean(p) - np.mean(r) for p, r in zip(predicted, realised, strict=True)]
     return {
-        "return": float(totals[0]),
-        "simulated steps": float(mean[0]),
-        "critic evaluations": float(mean[1]),
-        "ms": float(mean[2]),
-        "decisions": n_decisions,
+        "returns": [sum(episode) for episode in rewards],
+        "lengths": [len(episode) for episode in rewards],
+        "simulated steps": simulated / decisions,
+        "critic evaluations": evaluated / decisions,
+        "ms": 1000 * seconds / decisions,
+        "cpu ms": 1000 * cpu_seconds / decisions,
+        "invalid rollouts": invalid,
+        "predicted": float(np.mean(np.concatenate(predicted))),
+        "realised": float(np.mean(np.concatenate(realised))),
+        "errors by episode": [float(error) for error in errors],
     }
 
 
+def discounted(rewards: list[float], closing: float, gamma: float) -> np.ndarray:
+    """The discounted return from every step on.
+
+    :param rewards: of an episode.
+    :param closing: value of its last state; 0 if it terminated.
+    :param gamma: discount factor.
+    """
+    returns, value = np.zeros(len(rewards)), closing
+    for step in reversed(range(len(rewards))):
+        value = rewards[step] + gamma * value
+        returns[step] = value
+    return returns
+
+
+def reported_arms(rows: list[dict[str, Any]]) -> list[str]:
+    """The actor, the presets, and of each strategy and budget the best arm on the choosing seeds."""
+    scores = {
+        row["arm"]: np.mean(row["returns"])
+        for row in rows
+        if row["agent"] == CHOSEN_WITH and row["seeds"] == "choosing"
+    }
+    best: dict[Any, str] = {}
+    for arm in sorted(scores, key=lambda arm: scores[arm]):
+        best[ARMS[arm].get("strategy", "beam"), budget_of(arm)] = arm
+    presets = [SearchSettings.preset(name) for name in PRESETS]
+    wanted = {"actor alone", *best.values(), *(arm for arm in ARMS if SearchSettings(**ARMS[arm]) in presets)}
+    return [arm for arm in ARMS if arm in wanted or arm.endswith((", soft", ", truncated"))]
+
+
+def by_cost(arms: list[str]) -> list[str]:
+    """The cheapest first."""
+    return sorted(arms, key=lambda arm: SearchSettings(**ARMS[arm]).simulated_steps())
+
+
+def measured() -> list[dict[str, Any]]:
+    """The rows that the file of results holds."""
+    path = RESULTS / f"{FILE}.json"
+    return json.loads(path.read_text())["results"] if path.exists() else []
+
+
+def show(rows: list[dict[str, Any]]) -> None:
+    """Print a table for every agent and set of seeds."""
+    header = ["", "return", "least", "most", "simulated steps", "critic evaluations", "cpu ms",
+              "predicted", "predicted - realised"]  # fmt: skip
+    for agent, seeds in dict.fromkeys((row["agent"], row["seeds"]) for row in rows):
+        table = [
+            [row["arm"], float(np.mean(row["returns"])), min(row["returns"]), max(row["returns"]),
+             *(float(row.get(name, "nan")) for name in header[4:8]), row["predicted"] - row["realised"]]
+            for row in rows
+            if (row["agent"], row["seeds"]) == (agent, seeds)
+        ]  # fmt: skip
+        print(f"\n{agent}, {seeds} seeds {list(SEEDS[seeds])}\n")
+        print_table(header, sorted(table, key=lambda line: (round(line[4], -1), line[1])))
+
+
+def draw(rows: list[dict[str, Any]], path: Path) -> None:
+    """Draw returns against simulated steps, a panel for every agent.
+
+    :param rows: of the file of results.
+    :param path: of the figure.
+    """
+    agents = list(dict.fromkeys(row["agent"] for row in rows))
+    figure = Figure(figsize=(5.5 * len(agents), 4), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(1, len(agents), squeeze=False)[0]
+    for agent, panel in zip(agents, panels, strict=True):
+        of_agent = [row for row in rows if row["agent"] == agent]
+        actor = [np.mean(row["returns"]) for row in of_agent if row["arm"] == "actor alone"][-1]
+        panel.axhline(actor, color="grey", linestyle=":", label="actor alone")
+        for strategy, marker in (("beam", "o"), ("tree", "^"), ("refine", "s")):
+            for seeds, filled in (("choosing", False), ("reporting", True)):
+                points = [
+                    (row["simulated steps"], np.mean(row["returns"]))
+                    for row in of_agent
+                    if row["seeds"] == seeds
+                    and row["settings"].get("strategy", "beam") == strategy
+                    and row["simulated steps"] > 0
+                ]
+                if points:
+                    name = f"{strategy}, {seeds} seeds"
+                    face = None if filled else "none"
+                    panel.plot(*zip(*points, strict=True), marker, label=name, markerfacecolor=face)
+        panel.set(xscale="log", xlabel="simulated steps per decision", ylabel="return", title=agent)
+        panel.legend(fontsize=8)
+    figure.savefig(path, dpi=120)
+
+
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("agent", type=Path, help="zip of a TD3, DDPG, SAC or TQC agent")
-    parser.add_argument("env", help="its environment, for example HalfCheetah-v4")
-    parser.add_argument("--seeds", type=int, nargs="+", default=list(range(200, 210)))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("agent", type=Path, nargs="?", help="zip of a TD3, DDPG, SAC or TQC agent")
+    parser.add_argument("env", nargs="?", help="its environment, for example HalfCheetah-v4")
+    parser.add_argument("--seeds", choices=SEEDS, default="choosing")
+    parser.add_argument("--arms", choices=ARMS, nargs="+", metavar="ARM", help="only these, in this order")
+    parser.add_argument("--most", type=int, default=1000, help="simulated steps of the arms that are run")
+    parser.add_argument("--table", action="store_true", help="only show what was measured, and draw it")
     arguments = parser.parse_args()
+    if arguments.table:
+        show(measured())
+        draw(measured(), FIGURE)
+        return
     th.set_num_threads(1)
     agent = load_agent(arguments.agent, make_vec_env(arguments.env, 1), device="cpu")
-    rows: list[dict[str, Any]] = []
-    for seed in arguments.seeds:
-        for arm, settings in ARMS.items():
-            result = run_episode(agent, arguments.env, seed, settings)
-            rows.append({"arm": arm, "seed": seed, **result})
-            print(rows[-1], flush=True)
-        write(f"strategies-{arguments.agent.stem}", {"environment": arguments.env, "rows": rows})
-    table = []
-    for arm in ARMS:
-        mine = [row for row in rows if row["arm"] == arm]
-        returns = [row["return"] for row in mine]
-        costs = [
-            np.mean([row[name] for row in mine]) for name in ("simulated steps", "critic evaluations", "ms")
-        ]
-        table.append(
-            [arm, len(mine), float(np.mean(returns)), min(returns), max(returns), *map(float, costs)]
-        )
-    header = ["", "episodes", "return", "least", "most", "simulated steps", "critic evaluations", "ms"]
-    print_table(header, table)
+    arms = by_cost(list(ARMS) if arguments.seeds == "choosing" else reported_arms(measured()))
+    for arm in arguments.arms or arms:
+        of = {
+            "agent": arguments.agent.stem,
+            "environment": arguments.env,
+            "seeds": arguments.seeds,
+            "arm": arm,
+        }
+        rows, settings = measured(), ARMS[arm]
+        # Others may have added arms meanwhile, so the file is read again.
+        done = any(of.items() <= row.items() and row["settings"] == settings for row in rows)
+        costly = SearchSettings(**settings).simulated_steps() > arguments.most
+        if done or costly or not has_value(agent, settings):
+            continue
+        result = run_arm(agent, arguments.env, SEEDS[arguments.seeds], settings)
+        write(FILE, [*measured(), {**of, "settings": settings, **result}])
+        print(arm, f"{np.mean(result['returns']):.0f}", f"{result['simulated steps']:.0f}", flush=True)
 
 
 if __name__ == "__main__":

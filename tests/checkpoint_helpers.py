@@ -101,6 +101,8 @@ def assert_same_runs(left: OffPolicyAlgorithm, right: OffPolicyAlgorithm) -> Non
                 other = theirs[name] if key is None else theirs[name][key]
                 np.testing.assert_array_equal(array, other, err_msg=f"{name} {key}")
     assert_same_optimizers(left, right)
+    for name in ("log_ent_coef", "ent_coef_tensor"):
+        assert getattr(left, name, None) == getattr(right, name, None), name
     # What comes next is equal too: the generators are where they were.
     assert left.action_space.sample().tolist() == right.action_space.sample().tolist()
 

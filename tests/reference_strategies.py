@@ -1,6 +1,6 @@
-"""Tree and refinement with loops, one simulation at a time: the oracles for the batched strategies.
+"""The strategies with loops, one simulation at a time: the oracles for the batched ones.
 
-Both use a :class:`~tests.reference_search.Reference` as the simulator of one environment: its ``restore``,
+All use a :class:`~tests.reference_search.Reference` as the simulator of one environment: its ``restore``,
 ``env_step``, ``policy``, ``critics`` and ``gamma``. Every simulation starts at the root again and repeats its
 actions. A step whose reward is NaN has diverged. Random numbers are handed in.
 """
@@ -30,6 +30,86 @@ class Outcome:
     plan: np.ndarray | None = None
 
 
+def principal_directions(actions: np.ndarray, number: int) -> np.ndarray:
+    """``[number, act_dim]``, in which actions ``[n, act_dim]`` vary most around their mean."""
+    deviations = np.array(actions, dtype=np.float64) - np.mean(actions, axis=0, dtype=np.float64)
+    return np.linalg.svd(deviations)[2][:number]
+
+
+def along(coordinates, directions) -> np.ndarray:
+    """Walk some way along each direction; the other coordinates are not used."""
+    total = np.zeros(len(directions[0]))
+    for coordinate, direction in zip(coordinates[: len(directions)], directions, strict=True):
+        total += float(coordinate) * direction
+    return total
+
+
+def low_dimensional(noise: np.ndarray, directions) -> np.ndarray:
+    """Noise ``[n, act_dim]`` along the directions alone, with the total variance that it had in all."""
+    widen = math.sqrt(len(directions[0]) / len(directions))
+    return np.array([widen * along(one, directions) for one in noise])
+
+
+class ReferenceBeam:
+    """Algorithm 1 with noise that is held for several steps, in one environment.
+
+    :param reference: the simulator and the agent
+    :param depth: macro-steps
+    :param hold: environment steps of each
+    :param include_policy_action: whether the first candidate is the policy's own action
+    """
+
+    def __init__(self, reference: Reference, depth: int, hold: int, include_policy_action: bool) -> None:
+        self.reference, self.depth, self.hold = reference, depth, hold
+        self.include_policy_action = include_policy_action
+        self.outcome = Outcome()
+
+    def choose(self, observation, beam_noise, rollout_noise, shared: bool) -> Outcome:
+        """
+        :param observation: the present one
+        :param beam_noise: ``[beam, act_dim]``
+        :param rollout_noise: ``[depth, beam, sim, act_dim]``
+        :param shared: whether simulations of a candidate count as one until their noise differs
+        """
+        n_simulations = rollout_noise.shape[2]
+        for i, noise in enumerate(beam_noise):
+            if self.include_policy_action and i == 0:
+                noise = np.zeros_like(noise)
+            action = clip(self.reference.policy(observation) + noise)
+            self.outcome.candidates.append(action)
+            values = []
+            for j in range(n_simulations):
+                offsets = [noise, *rollout_noise[:, i, j]]
+                value, steps = self.rollout(action, offsets)
+                values.append(value)
+                self.outcome.steps += max(0, steps - self.hold) if shared and j > 0 else steps
+            mean = sum(values) / n_simulations
+            self.outcome.values.append(mean if math.isfinite(mean) else -math.inf)
+        if max(self.outcome.values) > -math.inf:
+            best = self.outcome.values.index(max(self.outcome.values))
+            self.outcome.action = self.outcome.candidates[best]
+        return self.outcome
+
+    def rollout(self, action, offsets: list) -> tuple[float, int]:
+        """
+        :param offsets: the noise of every macro-step, and of the action that closes the rollout
+        :return: the value and the simulated steps
+        """
+        reference, total, steps = self.reference, 0.0, 0
+        reference.restore()
+        for macro_step in range(self.depth):
+            for _ in range(self.hold):
+                if steps > 0:
+                    action = clip(reference.policy(observation) + offsets[macro_step])  # noqa: F821
+                observation, reward, done = reference.env_step(action)
+                total += reference.gamma**steps * float(reward)
+                steps += 1
+                if done or math.isnan(total):
+                    return total, steps
+        action = clip(reference.policy(observation) + offsets[self.depth])
+        return total + reference.gamma**steps * min(reference.critics(observation, action)), steps
+
+
 @dataclass
 class Node:
     actions: list[np.ndarray]
@@ -57,6 +137,7 @@ class ReferenceTree:
     :param branching: children of each
     :param include_policy_action: whether the first child's action is the policy's own
     :param one_node_per_root: whether only the best node of each root action is kept
+    :param hold: environment steps between two depths, with the same noise
     """
 
     def __init__(
@@ -66,9 +147,11 @@ class ReferenceTree:
         branching: int,
         include_policy_action: bool = False,
         one_node_per_root: bool = False,
+        hold: int = 1,
     ) -> None:
         self.reference, self.width, self.branching = reference, width, branching
         self.include_policy_action, self.one_node_per_root = include_policy_action, one_node_per_root
+        self.hold = hold
         self.outcome = Outcome()
 
     def choose(self, observation, root_noise: np.ndarray, later_noise: np.ndarray) -> Outcome:
@@ -79,17 +162,17 @@ class ReferenceTree:
         """
         n_roots = self.width * self.branching
         ranking = []
-        for root, action in enumerate(self.children(observation, root_noise, n_roots)):
+        for root, (action, noise) in enumerate(self.children(observation, root_noise, n_roots)):
             self.outcome.candidates.append(action)
             self.outcome.values.append(-math.inf)
-            ranking += self.simulate([action], root)
+            ranking += self.simulate([action], noise, root)
         kept = self.keep(ranking)
         for noise in later_noise:
             ranking = []
             for slot, node in enumerate(kept):
                 if not node.done:
-                    for action in self.children(node.observation, noise[slot], self.branching):
-                        ranking += self.simulate([*node.actions, action], node.root)
+                    for action, held in self.children(node.observation, noise[slot], self.branching):
+                        ranking += self.simulate([*node.actions, action], held, node.root)
             ranking += [node for node in kept if node.done]
             kept = self.keep(ranking)
         if kept:
@@ -98,23 +181,30 @@ class ReferenceTree:
         self.outcome.surviving_roots = len({node.root for node in kept})
         return self.outcome
 
-    def children(self, observation, noise: np.ndarray, number: int) -> list[np.ndarray]:
+    def children(self, observation, noise: np.ndarray, number: int) -> list[tuple]:
         mean = self.reference.policy(observation)
-        actions = [clip(mean + one) for one in noise]
+        offsets = list(noise)
         if self.include_policy_action:
-            actions[0] = mean
+            offsets[0] = np.zeros_like(offsets[0])
+        actions = [clip(mean + one) for one in offsets]
         always = int(self.include_policy_action)
-        return [actions[i] for i in shortlist(self.reference, observation, actions, number, always)]
+        kept = shortlist(self.reference, observation, actions, number, always)
+        return [(actions[i], offsets[i]) for i in kept]
 
-    def simulate(self, actions: list[np.ndarray], root: int) -> list[Node]:
-        """The node at the end of some actions, in a list that is empty if the last step diverged."""
+    def simulate(self, actions: list[np.ndarray], noise: np.ndarray, root: int) -> list[Node]:
+        """The node after some actions and what follows the last, in a list that is empty if it diverged."""
         reference, gamma = self.reference, self.reference.gamma
         reference.restore()
-        total = 0.0
+        total, n_new = 0.0, 0
+        actions = list(actions)
         for depth, action in enumerate(actions):
             observation, reward, done = reference.env_step(action)
             total += gamma**depth * float(reward)
-        self.outcome.steps += 1  # the others are repetitions
+            # The last macro-step alone is new, the others are repetitions.
+            n_new += n_new > 0 or depth == len(actions) - 1
+            if 0 < n_new < self.hold and not done and not math.isnan(total):
+                actions.append(clip(reference.policy(observation) + noise))
+        self.outcome.steps += n_new
         if math.isnan(total):
             return []
         score = total
@@ -146,6 +236,8 @@ class ReferenceRefine:
     :param spreads: ``[depth]``, standard deviations of the first round
     :param min_noise: their floor in later rounds
     :param include_policy_action: whether the policy alone is a plan of the first round
+    :param hold: environment steps for which each offset of a plan stays
+    :param directions: ``[dims, act_dim]``, along which plans differ; the noise has those coordinates
     """
 
     def __init__(
@@ -156,7 +248,10 @@ class ReferenceRefine:
         spreads: list[float],
         min_noise: float,
         include_policy_action: bool = False,
+        hold: int = 1,
+        directions: np.ndarray | None = None,
     ) -> None:
+        self.hold, self.directions = hold, directions
         self.reference, self.width, self.n_elites = reference, width, n_elites
         self.spreads, self.min_noise = spreads, min_noise
         self.include_policy_action = include_policy_action
@@ -169,10 +264,16 @@ class ReferenceRefine:
         """
         outcome = Outcome()
         mean = np.asarray(remembered, dtype=np.float32)
-        spread = np.repeat(np.float32(self.spreads)[:, None], mean.shape[1], axis=1)
+        directions = np.eye(mean.shape[1]) if self.directions is None else self.directions
+        dims = len(directions)
+        widen = math.sqrt(mean.shape[1] / dims)
+        spread = widen * np.repeat(np.float32(self.spreads)[:, None], dims, axis=1)
         plans: list[np.ndarray] = []
         for number, of_round in enumerate(noise):
-            drawn = [mean + one * spread for one in of_round]
+            drawn = [
+                np.float32(mean + [along(z[:dims] * s, directions) for z, s in zip(one, spread, strict=True)])
+                for one in of_round
+            ]
             drawn[0] = mean
             if number == 0 and self.include_policy_action and mean.any():
                 drawn[1] = np.zeros_like(mean)
@@ -186,8 +287,8 @@ class ReferenceRefine:
             elites = [plans[i] for i in ranked if outcome.values[i] > -math.inf]
             if elites:
                 mean = np.mean(elites, axis=0)
-                floor = np.float32([[min(self.min_noise, of_first)] for of_first in self.spreads])
-                spread = np.maximum(np.std(elites, axis=0), floor)
+                floor = np.float32([[widen * min(self.min_noise, of_first)] for of_first in self.spreads])
+                spread = np.maximum(np.std(np.array(elites) @ directions.T, axis=0), floor)
         if max(outcome.values) > -math.inf:
             chosen = outcome.values.index(max(outcome.values))
             outcome.action, outcome.plan = outcome.candidates[chosen], plans[chosen]
@@ -197,7 +298,7 @@ class ReferenceRefine:
         reference = self.reference
         reference.restore()
         total, discount = 0.0, 1.0
-        for residual in plan:
+        for residual in np.repeat(plan, self.hold, axis=0):
             action = clip(reference.policy(observation) + residual)
             observation, reward, done = reference.env_step(action)
             outcome.steps += 1

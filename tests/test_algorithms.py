@@ -14,7 +14,7 @@ from tests.conftest import SEARCHING, SMALL_SEARCH, WITHOUT_SEARCH
 
 def own_settings(cls) -> set[str]:
     """The keyword-only parameters that are not fields of SearchSettings."""
-    return {"action_noise_after_search", *(["fast_update"] if issubclass(cls, FastUpdate) else [])}
+    return {"action_noise_after_search", "preset", *(["fast_update"] if issubclass(cls, FastUpdate) else [])}
 
 
 @pytest.mark.parametrize("cls", SEARCHING)

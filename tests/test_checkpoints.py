@@ -75,8 +75,13 @@ RUNS = {
     "MCBSTD3, pool": maker(MCBSTD3, forward_model="pool"),
     "MCBSTD3, MuJoCo": maker(MCBSTD3, "InvertedPendulum-v5"),
     "MCBSDDPG": maker(MCBSDDPG),
+    "MCBSDDPG, refinement of a preset": maker(MCBSDDPG, preset="balanced"),
+    "MCBSSAC, soft values": maker(MCBSSAC, entropy_bonus=True),
     "MCBSSAC, gSDE": maker(MCBSSAC, use_sde=True, use_sde_at_warmup=True),
     "MCBSTQC": maker(MCBSTQC),
+    "MCBSTQC, soft and truncated values, MuJoCo": maker(
+        MCBSTQC, "InvertedPendulum-v5", entropy_bonus=True, tqc_value="truncated", ent_coef=0.1
+    ),
     "TD3, Ornstein-Uhlenbeck, two environments": maker(TD3, n_envs=2, action_noise=OU_NOISE),
     "TD3, whole episodes": maker(TD3, "InvertedPendulum-v5", train_freq=(1, "episode"), gradient_steps=-1),
     "DDPG, large buffer": maker(DDPG, buffer_size=1000),
@@ -231,6 +236,15 @@ def test_settings_are_those_of_the_run(tmp_path):
     crash(maker(MCBSTD3, beam_noise=0.37, gamma=0.9), tmp_path, 150, 105)
     agent = resume(tmp_path / "checkpoints")
     assert (agent.beam_noise, agent.gamma, agent.beam_width) == (0.37, 0.9, 3)
+
+
+@pytest.mark.parametrize("cls", [MCBSTD3, MCBSDDPG, MCBSSAC, MCBSTQC])
+def test_settings_that_override_a_preset_are_those_of_the_run(cls, tmp_path):
+    make = maker(cls, preset="strong", strategy="beam", rollout_noise=0.2, n_elites=None)
+    crash(make, tmp_path, 60, 45)
+    agent = resume(tmp_path / "checkpoints")
+    assert agent.search_settings == make(tmp_path / "other").search_settings
+    assert (agent.preset, agent.n_rounds, agent.strategy, agent.beam_width) == ("strong", 4, "beam", 3)
 
 
 def test_learn_may_be_called_again(tmp_path):

@@ -77,7 +77,7 @@ def test_killed_while_writing(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("algorithm", ["mcbs_td3", "td3", "sac"])
+@pytest.mark.parametrize("algorithm", ["mcbs_td3", "mcbs_ddpg", "mcbs_sac", "mcbs_tqc", "td3", "sac"])
 def test_killed_and_stopped_again_and_again(algorithm, tmp_path):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     assert start(algorithm, WORKERS, whole, 3000, 100).wait(300) == 0

@@ -133,6 +133,10 @@ def test_common_noise_makes_equal_candidates_equal():
         (dict(common_noise=True, rollout_depth=1, strategy="tree"), "leave it out"),
         (dict(common_noise=True, strategy="refine"), "no meaning"),
         (dict(n_rounds=0), "n_rounds"),
+        (dict(entropy_bonus=True, rollout_depth=0), "entropy_bonus needs a rollout_depth of 1"),
+        (dict(entropy_bonus=True, strategy="tree"), "entropy_bonus works with strategy='beam' only"),
+        (dict(entropy_bonus=True, strategy="refine"), "entropy_bonus works with strategy='beam' only"),
+        (dict(tqc_value="median"), "tqc_value must be one of"),
         (dict(n_elites=7), "n_elites must be between 1 and 6"),
         (dict(min_noise=-0.1), "min_noise"),
     ],
@@ -142,7 +146,7 @@ def test_senseless_combinations_are_refused(changes, words):
         SearchSettings(**changes)
 
 
-@pytest.mark.parametrize("name", ["common_noise", "antithetic", "one_node_per_root"])
+@pytest.mark.parametrize("name", ["common_noise", "antithetic", "one_node_per_root", "entropy_bonus"])
 def test_switches_are_booleans(name):
     with pytest.raises(TypeError, match=f"{name} must be True or False"):
         SearchSettings(**{name: 1})

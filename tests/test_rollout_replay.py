@@ -160,10 +160,12 @@ def test_the_fast_update_uses_them_as_sb3s_does(make_agent):
         th.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-6)
 
 
-def test_every_environment_is_simulated_but_only_scheduled_ones_are_executed(make_agent):
+@pytest.mark.parametrize("cls", SEARCHING)
+def test_every_environment_is_simulated_but_only_scheduled_ones_are_executed(make_agent, cls):
     agents = [
         make_agent(
             snapshot_vec_env("Pendulum-v1", 2),
+            cls=cls,
             search_share=0.0,
             rollout_replay=share,
             gradient_steps=0,
@@ -181,9 +183,10 @@ def test_every_environment_is_simulated_but_only_scheduled_ones_are_executed(mak
     assert (lengths[10:30, :, :6] == 2).all() and not lengths[:10].any(), "none of the random actions before"
 
 
-def test_normalised_and_dict_observations(make_agent, make_dict_env):
+@pytest.mark.parametrize("cls", SEARCHING)
+def test_normalised_and_dict_observations(make_agent, make_dict_env, cls):
     env = VecNormalize(DummyVecEnv([make_dict_env]))
-    agent = make_agent(env, policy="MultiInputPolicy", rollout_replay=0.5)
+    agent = make_agent(env, cls=cls, policy="MultiInputPolicy", rollout_replay=0.5)
     agent.learn(60)
     store = agent._rollout_store()
     buffer = agent.replay_buffer
@@ -198,12 +201,13 @@ def test_normalised_and_dict_observations(make_agent, make_dict_env):
     np.testing.assert_allclose(samples.rewards, raw.rewards / scale, rtol=1e-4)
 
 
-def test_rollouts_are_saved_with_the_replay_buffer(make_agent, tmp_path):
-    agent = make_agent(rollout_replay=0.5)
+@pytest.mark.parametrize("cls", SEARCHING)
+def test_rollouts_are_saved_with_the_replay_buffer(make_agent, tmp_path, cls):
+    agent = make_agent(cls=cls, rollout_replay=0.5)
     agent.learn(60)
     agent.save(tmp_path / "agent")
     agent.save_replay_buffer(tmp_path / "buffer")
-    loaded = MCBSTD3.load(tmp_path / "agent", env=snapshot_vec_env("Pendulum-v1"))
+    loaded = cls.load(tmp_path / "agent", env=snapshot_vec_env("Pendulum-v1"))
     assert loaded.rollout_replay == 0.5 and loaded._rollout_store().count == 0
     loaded.load_replay_buffer(tmp_path / "buffer")
     assert loaded._rollout_store().count == agent._rollout_store().count > 0
@@ -214,15 +218,18 @@ def test_rollouts_are_saved_with_the_replay_buffer(make_agent, tmp_path):
     loaded.learn(30, reset_num_timesteps=False)
 
 
-@pytest.mark.parametrize("env_id, n_envs, size", [("Pendulum-v1", 1, 100), ("InvertedPendulum-v5", 2, 2000)])
-def test_a_resumed_run_learns_from_the_same_rollouts(make_agent, tmp_path, env_id, n_envs, size):
+@pytest.mark.parametrize(
+    "cls, env_id, n_envs, size",
+    [(MCBSTD3, "InvertedPendulum-v5", 2, 2000), *((cls, "Pendulum-v1", 1, 100) for cls in SEARCHING)],
+)
+def test_a_resumed_run_learns_from_the_same_rollouts(make_agent, tmp_path, cls, env_id, n_envs, size):
     def make_env(folder):
         return snapshot_vec_env(env_id, n_envs)
 
     def make(folder):
         noise = NormalActionNoise(np.zeros(1), 0.2 * np.ones(1))
         settings = dict(rollout_replay=0.5, search_share=0.5, action_noise=noise, buffer_size=size)
-        return make_agent(make_env(folder), **settings)
+        return make_agent(make_env(folder), cls=cls, **settings)
 
     whole, resumed = assert_resumed_is_exact(make, tmp_path, 180, 130, make_env=make_env)
     assert whole._rollout_store().count == resumed._rollout_store().count > 0
@@ -239,6 +246,7 @@ def test_a_resumed_run_learns_from_the_same_rollouts(make_agent, tmp_path, env_i
         (dict(rollout_replay=0.5, time_budget=0.01), "strategy='beam'"),
     ],
 )
-def test_what_makes_no_sense_is_refused(make_agent, settings, words):
+@pytest.mark.parametrize("cls", SEARCHING)
+def test_what_makes_no_sense_is_refused(make_agent, cls, settings, words):
     with pytest.raises(ValueError, match=words):
-        make_agent(**settings)
+        make_agent(cls=cls, **settings)

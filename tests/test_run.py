@@ -1,11 +1,13 @@
 """Agents that search train: every kind of environment and policy, SB3's own behaviour kept."""
 
 import json
+from itertools import pairwise
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from stable_baselines3.common.callbacks import CallbackList, CheckpointCallback, EvalCallback
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, CheckpointCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
@@ -80,11 +82,12 @@ def test_many_environments(make_agent, cls, env_id, vec_env_cls):
     env.close()
 
 
-def test_processes_and_one_process_train_alike(make_agent):
+@pytest.mark.parametrize("cls", SEARCHING)
+def test_processes_and_one_process_train_alike(make_agent, cls):
     agents = []
     for vec_env_cls in (DummyVecEnv, SubprocVecEnv):
         env = snapshot_vec_env("HalfCheetah-v5", 2, vec_env_cls=vec_env_cls)
-        agents.append(make_agent(env).learn(50))
+        agents.append(make_agent(env, cls=cls).learn(50))
         env.close()
     assert_same_parameters(*agents)
 
@@ -101,7 +104,7 @@ def test_unknown_vectorized_wrapper_is_refused(make_agent):
         make_agent(VecFrameStack(make_vec_env("Pendulum-v1", 1), 2))
 
 
-@pytest.mark.parametrize("cls", [MCBSTD3, MCBSSAC])
+@pytest.mark.parametrize("cls", SEARCHING)
 def test_same_seed_same_run_and_threads_change_nothing(make_agent, cls):
     one, two, other = (
         make_agent("Hopper-v5", cls=cls, seed=s, n_threads=n).learn(60) for s, n in [(3, 1), (3, 2), (4, 1)]
@@ -142,6 +145,36 @@ def test_search_is_around_the_mean_action(make_agent, cls, settings):
     assert np.abs(drawn - mean).max() > 0.1
 
 
+class NotesRandomness(BaseCallback):
+    """Keeps torch's random state and gSDE's exploration matrix after every step."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.states, self.matrices = [], []
+
+    def _on_step(self) -> bool:
+        self.states.append(th.get_rng_state().numpy())
+        self.matrices.append(self.model.actor.action_dist.exploration_mat.detach().numpy().copy())
+        return True
+
+
+@pytest.mark.parametrize("cls", [MCBSSAC, MCBSTQC])
+@pytest.mark.parametrize("entropy_bonus", [False, True])
+def test_searching_leaves_gsdes_resampling_as_it_is(make_agent, cls, entropy_bonus):
+    """The matrices are those of the agent without search, step by step, and so is all later randomness."""
+    noted = []
+    for which, search in ((WITHOUT_SEARCH[cls], {}), (cls, dict(entropy_bonus=entropy_bonus))):
+        agent = make_agent(cls=which, learning_rate=0.0, **GSDE, **search)
+        noted.append(NotesRandomness())
+        agent.learn(60, callback=noted[-1])
+    plain, searching = noted
+    assert agent.n_decisions == 40
+    np.testing.assert_array_equal(plain.matrices, searching.matrices)
+    np.testing.assert_array_equal(plain.states, searching.states)
+    changes = [not np.array_equal(*pair) for pair in pairwise(searching.matrices[20:])]
+    assert any(changes), "it was resampled while there was search"
+
+
 @pytest.mark.parametrize("cls", SEARCHING)
 def test_searched_action_is_executed_and_stored_as_it_is(make_agent, cls):
     """RL Zoo's settings contain action noise; SB3 would add it to the chosen action."""
@@ -177,8 +210,9 @@ def test_action_noise_after_search_is_an_option(make_agent, cls):
     assert np.mean(np.abs(loud) == 1) > 0.5 > np.mean(np.abs(quiet) == 1)
 
 
-def test_logs(make_agent, tmp_path):
-    agent = make_agent("Pendulum-v1", learning_starts=100)
+@pytest.mark.parametrize("cls", SEARCHING)
+def test_logs(make_agent, tmp_path, cls):
+    agent = make_agent("Pendulum-v1", cls=cls, learning_starts=100)
     read = logged(agent, tmp_path)
     agent.learn(400, log_interval=1)
     entries = [entry for entry in read() if entry.get("search/decisions")]
@@ -245,8 +279,9 @@ def test_monitor_file_counts_only_real_episodes(make_agent, tmp_path):
     assert [row.split(",")[1] for row in rows] == ["200", "200"]
 
 
-def test_callbacks_and_set_env(make_agent, tmp_path):
-    agent = make_agent("Pendulum-v1", verbose=0)
+@pytest.mark.parametrize("cls", SEARCHING)
+def test_callbacks_and_set_env(make_agent, tmp_path, cls):
+    agent = make_agent("Pendulum-v1", cls=cls, verbose=0)
     callbacks = CallbackList(
         [
             CheckpointCallback(25, str(tmp_path)),

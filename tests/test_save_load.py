@@ -1,11 +1,14 @@
 """Saving and loading, as in SB3, with the search's settings."""
 
+from copy import deepcopy
+
 import numpy as np
 import pytest
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_mcbs import MCBSTD3
-from tests.conftest import SEARCHING, WITHOUT_SEARCH, assert_same_parameters
+from sb3_mcbs.search import PRESETS, SearchSettings
+from tests.conftest import SEARCHING, SMALL, WITHOUT_SEARCH, assert_same_parameters, snapshot_vec_env
 
 
 @pytest.mark.parametrize("cls", SEARCHING)
@@ -58,6 +61,26 @@ def test_a_file_of_the_agent_without_search_loads(make_agent, tmp_path, cls):
     assert_same_parameters(plain, agent)
     agent.learn(20, reset_num_timesteps=False)
     assert agent.n_decisions == 20 and agent.beam_width == 4
+
+
+@pytest.mark.parametrize("cls", SEARCHING)
+def test_presets_are_where_settings_start_from(tmp_path, cls):
+    def make(**settings):
+        return cls("MlpPolicy", snapshot_vec_env("Pendulum-v1"), n_threads=1, **deepcopy(SMALL), **settings)
+
+    agent = make(preset="balanced", beam_width=5)
+    assert agent.search_settings == SearchSettings.preset("balanced", beam_width=5, n_threads=1)
+    agent.save(tmp_path / "agent")
+    loaded = cls.load(tmp_path / "agent", env=snapshot_vec_env("Pendulum-v1"), device="cpu")
+    assert (loaded.preset, loaded.search_settings) == ("balanced", agent.search_settings)
+    assert make(preset=None).search_settings == SearchSettings(n_threads=1)
+    for unknown in ("quick", 3, ["paper"]):
+        with pytest.raises(ValueError, match=r"There is no preset .*; known are paper, efficient"):
+            make(preset=unknown)
+    with pytest.raises(ValueError, match=r"preset='strong' is for constructors.*PRESETS\['strong'\]"):
+        cls.load(tmp_path / "agent", preset="strong", device="cpu")
+    changed = cls.load(tmp_path / "agent", device="cpu", **PRESETS["strong"])
+    assert changed.search_settings == SearchSettings.preset("strong", n_threads=1)
 
 
 def test_file_holds_no_model_of_the_environment(make_agent, tmp_path):

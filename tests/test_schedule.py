@@ -5,12 +5,13 @@ import pytest
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 
-from sb3_mcbs import MCBSSAC, MCBSTD3
+from sb3_mcbs import MCBSSAC, MCBSTD3, MCBSTQC
 from sb3_mcbs.search import ScheduleSettings, SearchSchedule, SearchSettings, draw_noise
 from tests.checkpoint_helpers import assert_resumed_is_exact
 from tests.conftest import SEARCHING, WITHOUT_SEARCH, assert_same_parameters, snapshot_vec_env
 
 EPISODE = 100
+GSDE = dict(use_sde=True, use_sde_at_warmup=True, sde_sample_freq=4)
 WINDOW = 1000
 
 
@@ -145,12 +146,14 @@ def test_settings_without_a_meaning_are_refused(make_agent, settings, search, wo
         make_agent(**settings, **search)
 
 
-@pytest.mark.parametrize("cls", SEARCHING)
-def test_without_searched_steps_an_agent_is_the_one_without_search(make_agent, cls):
+@pytest.mark.parametrize(
+    "cls, settings", [*((cls, {}) for cls in SEARCHING), (MCBSSAC, GSDE), (MCBSTQC, GSDE)]
+)
+def test_without_searched_steps_an_agent_is_the_one_without_search(make_agent, cls, settings):
     noise = OrnsteinUhlenbeckActionNoise(np.zeros(1), 0.3 * np.ones(1))
     agents = [
-        make_agent(snapshot_vec_env("Pendulum-v1", 2), cls=each, action_noise=noise, **settings)
-        for each, settings in (
+        make_agent(snapshot_vec_env("Pendulum-v1", 2), cls=each, action_noise=noise, **settings, **share)
+        for each, share in (
             (cls, dict(search_share=0.0, **(dict(fast_update=False) if "TD3" in cls.__name__ else {}))),
             (WITHOUT_SEARCH[cls], {}),
         )
@@ -167,12 +170,14 @@ def test_without_searched_steps_an_agent_is_the_one_without_search(make_agent, c
     assert_same_parameters(ours, plain)
 
 
-def test_streams_do_not_depend_on_the_schedule(make_agent):
+@pytest.mark.parametrize("cls", SEARCHING)
+def test_streams_do_not_depend_on_the_schedule(make_agent, cls):
     """What is not searched is the same whatever else is, until something searched changes the world."""
     first_unsearched = {}
     for share in (0.0, 0.5):
         agent = make_agent(
             snapshot_vec_env("Pendulum-v1", 4),
+            cls=cls,
             search_share=share,
             action_noise=NormalActionNoise(np.zeros(1), 0.2 * np.ones(1)),
         )
@@ -262,14 +267,14 @@ def test_what_is_logged(make_agent):
     assert (logged["search/beam_width"], logged["search/rollout_depth"]) == (1, 1)
 
 
-@pytest.mark.parametrize("unit", ["step", "episode"])
-def test_a_resumed_run_keeps_its_schedule(make_agent, tmp_path, unit):
+@pytest.mark.parametrize("cls, unit", [(MCBSTD3, "step"), *((cls, "episode") for cls in SEARCHING)])
+def test_a_resumed_run_keeps_its_schedule(make_agent, tmp_path, cls, unit):
     def make_env(folder):
         return VecNormalize(snapshot_vec_env("Pendulum-v1", 2))
 
     def make(folder):
         settings = dict(SATURATION, saturation_window=20, search_unit=unit, search_share=0.8)
-        return make_agent(make_env(folder), **settings)
+        return make_agent(make_env(folder), cls=cls, **settings)
 
     whole, resumed = assert_resumed_is_exact(make, tmp_path, 1300, 1105, make_env=make_env, save_freq=500)
     assert whole.n_decisions == resumed.n_decisions > 500
@@ -282,16 +287,17 @@ def test_a_resumed_run_keeps_its_schedule(make_agent, tmp_path, unit):
         np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
 
 
-def test_a_saved_agent_keeps_its_schedule_and_takes_new_settings(make_agent, tmp_path):
-    agent = make_agent(**SATURATION)
+@pytest.mark.parametrize("cls", SEARCHING)
+def test_a_saved_agent_keeps_its_schedule_and_takes_new_settings(make_agent, tmp_path, cls):
+    agent = make_agent(cls=cls, **SATURATION)
     agent.learn(300)
     agent._schedule.saturation.is_reduced = True
     agent.save(tmp_path / "agent")
-    loaded = MCBSTD3.load(tmp_path / "agent", env=snapshot_vec_env("Pendulum-v1"))
+    loaded = cls.load(tmp_path / "agent", env=snapshot_vec_env("Pendulum-v1"))
     assert loaded._schedule.saturation.is_reduced and loaded._schedule.share(0.5) == 0.2
-    changed = MCBSTD3.load(
+    changed = cls.load(
         tmp_path / "agent", custom_objects={"search_schedule": "constant", "search_share": 0.25}
     )
     assert changed._schedule.share(0.5) == 0.25
     with pytest.raises(ValueError, match="search_share"):
-        MCBSTD3.load(tmp_path / "agent", custom_objects={"search_share": -1})
+        cls.load(tmp_path / "agent", custom_objects={"search_share": -1})

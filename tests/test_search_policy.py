@@ -96,6 +96,16 @@ def test_settings_default_to_the_agents(make_agent):
         SearchPolicy(agent, env, beam_with=3)
 
 
+@pytest.mark.parametrize("cls", [TD3, DDPG, SAC, TQC, *SEARCHING])
+def test_a_preset_takes_the_place_of_the_agents_settings(make_agent, cls):
+    env, agent = make_vec_env("Pendulum-v1", 1), make_agent(cls=cls)
+    policy = SearchPolicy(agent, env, preset="balanced", beam_width=5)
+    assert policy.settings == SearchSettings.preset("balanced", beam_width=5)
+    policy.predict(env.reset())
+    with pytest.raises(ValueError, match="There is no preset 'quick'"):
+        SearchPolicy(agent, env, preset="quick")
+
+
 def test_gym_environment(make_agent):
     agent = make_agent()
     with pytest.raises(TypeError, match="SnapshotEnvWrapper outermost"):

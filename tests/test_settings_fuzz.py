@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.noise import NormalActionNoise
 
-from sb3_mcbs import MCBSTD3, SearchPolicy, SearchSettings, SnapshotEnvWrapper
+from sb3_mcbs import MCBSTD3, MCBSTQC, SearchPolicy, SearchSettings, SnapshotEnvWrapper
 from sb3_mcbs.search import Agent, Decision, Pace, PlanMemory, deadline_search, search
 from tests.conftest import SMALL, snapshot_vec_env
 from tests.fake_model import LineWorld
@@ -74,6 +74,10 @@ VALID = {
     "n_rounds": integers(1, 3),
     "n_elites": st.none() | integers(1, 5),
     "min_noise": numbers(),
+    "entropy_bonus": st.booleans(),
+    "tqc_value": st.sampled_from(["mean", "truncated"]),
+    "noise_hold": integers(1, 3),
+    "proposal_dims": st.none() | integers(1, 1),  # actions have one entry here
 }
 assert VALID.keys() == set(SearchSettings.names())
 
@@ -94,9 +98,12 @@ def made(kwargs: dict[str, Any]) -> SearchSettings | None:
 
 def small(found: SearchSettings) -> bool:
     widest = max(found.beam_width, found.max_beam_width or 0)
-    factors = (found.n_simulations, max(found.rollout_depth, 1), found.branching, found.n_rounds)
+    factors = (found.n_simulations, max(found.horizon, 1), found.branching, found.n_rounds)
     return (
-        widest * math.prod(factors) <= 10_000 and (found.n_proposals or 0) <= 1000 and found.n_threads <= 64
+        widest * math.prod(factors) <= 10_000
+        and (found.n_proposals or 0) <= 1000
+        and found.n_threads <= 64
+        and (found.proposal_dims or 1) == 1
     )
 
 
@@ -115,12 +122,9 @@ def test_settings_are_refused_or_search_a_small_world(kwargs: dict[str, Any]) ->
     )
     rng, roots, observations = np.random.default_rng(0), [0.5, -1.0], np.array([[0.5], [-1.0]])
     if found.time_budget is None:
-        memory, moments = PlanMemory(2, found.rollout_depth, 1), [(0, 0), (0, 0)]
-        shape = (2, 1)
-        decision = Decision(
-            LineWorld(), roots, observations, agent, found, shape, rng, memory, range(2), moments
-        )
-        result = search(decision)
+        memory = PlanMemory(2, found.horizon, 1)
+        decision = Decision(LineWorld(), roots, observations, agent, found, (2, 1), rng)
+        result = search(decision._replace(memory=memory, envs=[0, 1], moments=[(0, 0), (0, 0)]))
     else:
         pace = Pace()
         deadline = pace.clock() + min(found.time_budget, 0.01)
@@ -130,10 +134,10 @@ def test_settings_are_refused_or_search_a_small_world(kwargs: dict[str, Any]) ->
 
 
 @pytest.fixture(scope="module")
-def pendulums() -> dict[str, tuple[MCBSTD3, Any]]:
-    """An agent and its environments for each kind of forward model."""
+def pendulums() -> dict[str, tuple[MCBSTQC, Any]]:
+    """An agent that no setting is refused for and its environments, for each kind of forward model."""
     return {
-        env_id: (MCBSTD3("MlpPolicy", env_id, seed=0, n_threads=1, **SMALL), snapshot_vec_env(env_id, 2))
+        env_id: (MCBSTQC("MlpPolicy", env_id, seed=0, n_threads=1, **SMALL), snapshot_vec_env(env_id, 2))
         for env_id in ("Pendulum-v1", "InvertedPendulum-v5")
     }
 

@@ -8,7 +8,7 @@ import torch as th
 import yaml
 from stable_baselines3.common.logger import Logger
 
-from sb3_mcbs import MCBSTD3, SearchPolicy, SnapshotEnvWrapper
+from sb3_mcbs import MCBSTD3, SearchPolicy, SearchSettings, SnapshotEnvWrapper
 from sb3_mcbs.zoo.callbacks import RenamingLogger, SearchEvalCallback, SecondEvalCallback
 from sb3_mcbs.zoo.paths import sibling_folder
 from sb3_mcbs.zoo.registration import ALGORITHMS
@@ -150,6 +150,27 @@ def test_mujoco_lands_on_the_batch(
     assert "Forward model: MuJoCo batch of HalfCheetahEnv" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_a_preset_of_the_command_line_goes_before_the_file(
+    algo: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = (
+        "-n",
+        "101",
+        "--eval-freq",
+        "-1",
+        "-params",
+        *TINY,
+        "preset:'strong'",
+        "beam_width:8",
+        "n_threads:1",
+    )
+    zoo_train(monkeypatch, tmp_path, algo, *words)
+    agent = ALGORITHMS[algo].load(tmp_path / "logs" / algo / "Pendulum-v1_1" / "Pendulum-v1.zip")
+    settings = SearchSettings.preset("strong", beam_width=8, n_threads=1)
+    assert (agent.preset, agent.search_settings) == ("strong", settings)
+
+
 def test_several_environments_in_this_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     zoo_train(monkeypatch, tmp_path, "mcbs_td3", "-n", "240", "--eval-freq", "200", "--eval-episodes", "1",
               "-params", *TINY_SEARCH, "n_envs:4")  # fmt: skip
@@ -176,6 +197,7 @@ def test_environments_in_worker_processes(tmp_path: Path, monkeypatch: pytest.Mo
         ("mcbs_td3", "{}", "mcbs_td3 is evaluated with its training's search settings already"),
         ("ppo", "{}", "ppo has no policy and critics to search with"),
         ("td3", "{'beam': 3}", "unknown settings: beam. Known are: beam_width"),
+        ("td3", "{'preset': 'quick'}", "There is no preset 'quick'"),
         ("td3", "'6,3,5'", "must be a dictionary of search settings"),
         ("td3", "{'beam_width': 0}", "beam_width must be between 1"),
     ],

@@ -10,7 +10,7 @@ import optuna
 import pytest
 
 from sb3_mcbs import SearchPolicy
-from sb3_mcbs.search import SearchSettings
+from sb3_mcbs.search import SearchSettings, with_preset
 from sb3_mcbs.zoo import sampler, train
 from sb3_mcbs.zoo.registration import ALGORITHMS
 from tests.zoo_helpers import TINY, zoo_train
@@ -39,8 +39,8 @@ def sample(params: dict[str, Any], base: str = "td3") -> dict[str, Any]:
 @pytest.mark.parametrize("base", BASES)
 def test_only_the_search_is_tuned_by_default(base: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(sampler.SWITCH, raising=False)
-    assert sample(SEARCH, base) == SEARCH
-    assert sampler.convert_mcbs_params(SEARCH) == SEARCH
+    assert sample(SEARCH, base) == {**SEARCH, "preset": None}
+    assert sampler.convert_mcbs_params(SEARCH) == {**SEARCH, "preset": None}
 
 
 @pytest.mark.parametrize("base", ["td3", "ddpg"])
@@ -100,21 +100,37 @@ def test_schedules_are_tuned_when_asked(
         sample({**params, "rollout_depth": 0, "n_simulations": 1})
 
 
-def test_strategies_are_tuned_when_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+def search_settings(params: dict[str, Any]) -> SearchSettings:
+    """What a trial searches with, whatever preset the hyperparameter file names."""
+    file = {"preset": "strong"}
+    params = {**file, **params}
+    return SearchSettings(**with_preset(params.pop("preset"), params))
+
+
+@pytest.mark.parametrize("base", BASES)
+def test_strategies_are_tuned_when_asked(base: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(sampler.SWITCH, "strategies")
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
     seen: dict[str, int] = {}
+    values = set()
+    held_or_narrow: set[tuple[int, int | None]] = set()
     for _ in range(400):
         trial = study.ask()
         try:
-            params = sampler.sample_mcbs_params("td3", trial, 1, 1, dict(NO_HER))
+            params = sampler.sample_mcbs_params(base, trial, 3, 1, dict(NO_HER))
         except optuna.TrialPruned:
             assert trial.user_attrs["pruned"]
             continue
-        settings = SearchSettings(**params)
+        settings = search_settings(params)
         assert settings.simulated_steps(deterministic=False) <= sampler.MAX_SIMULATED_STEPS
         assert sampler.convert_mcbs_params(trial.params) == params
+        assert (settings.proposal_dims or 0) < 3, "three directions are all of them"
+        held_or_narrow.add((settings.noise_hold, settings.proposal_dims))
         seen[settings.strategy] = seen.get(settings.strategy, 0) + 1
+        values.add((settings.entropy_bonus, settings.tqc_value))
+    assert {bonus for bonus, _ in values} == ({False, True} if base in ("sac", "tqc") else {False})
+    assert {value for _, value in values} == ({"mean", "truncated"} if base == "tqc" else {"mean"})
+    assert {(1, None), (2, 1), (3, 2)} <= held_or_narrow
     assert set(seen) == set(sampler.STRATEGIES) and min(seen.values()) >= 5
 
 
@@ -141,7 +157,7 @@ def test_every_other_combination_is_accepted_by_the_constructor() -> None:
             for n_simulations in sampler.N_SIMULATIONS:
                 params = {"beam_width": width, "rollout_depth": depth, "n_simulations": n_simulations}
                 try:
-                    SearchSettings(**sample({**params, "beam_noise": sampler.BEAM_NOISE[1]}))
+                    search_settings(sample({**params, "beam_noise": sampler.BEAM_NOISE[1]}))
                     accepted += 1
                 except optuna.TrialPruned:
                     assert depth == 0 or width * depth * n_simulations > sampler.MAX_SIMULATED_STEPS
@@ -191,6 +207,11 @@ def test_objective_is_the_actor_with_search(tmp_path: Path, monkeypatch: pytest.
     runs = sorted((tmp_path / "logs" / "mcbs_td3").glob("*/Pendulum-v1/config.yml"))
     config, _ = load_run(runs[-1].parents[1])
     assert config["beam_noise"] == best and config["beam_width"] == 2
+
+
+def test_trials_refuse_a_preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ValueError, match="leave preset out of -params"):
+        zoo_train(monkeypatch, tmp_path, "mcbs_td3", *WORDS, "--n-trials", "1", *PARAMS, "preset:'strong'")
 
 
 def test_invalid_combinations_do_not_end_a_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,6 +14,10 @@ from sb3_mcbs.algorithms.archive import AgentFileError, naming, read_members
 
 MAX_DATA_BYTES = 2**24
 MAX_POLICY_BYTES = 2**29
+MAX_VARIABLES_BYTES = 2**16
+VARIABLES = "pytorch_variables.pth"
+#: Shapes of what SB3 keeps of an entropy coefficient: the logarithm of a learned one, or a given one.
+_ENTROPY_SHAPES = {"log_ent_coef": (1,), "ent_coef_tensor": ()}
 
 
 @dataclass(frozen=True)
@@ -61,41 +65,59 @@ def read_agent_file(path: str | Path) -> AgentFile:
     if not isinstance(data, dict):
         raise AgentFileError(f"{path}: 'data' must be a JSON object, not a {type(data).__name__}.")
     unread = [name for name in names if name not in contents]
-    return AgentFile(path, data, _read_tensors(path, contents["policy.pth"]), unread)
+    return AgentFile(path, data, _read_tensors(path, "policy.pth", contents["policy.pth"]), unread)
 
 
-def _read_tensors(path: Path, content: bytes) -> dict[str, th.Tensor]:
-    with naming(path, "'policy.pth'"):
+def read_entropy_coefficient(path: Path) -> dict[str, th.Tensor]:
+    """Read the entropy coefficient of a SAC or TQC agent.
+
+    :param path: a zip file that ``save`` of an SB3 algorithm wrote.
+    :return: by the name of SB3's attribute, the coefficient or the logarithm of a learned one; empty if the
+        file has none.
+    :raises AgentFileError: if it is damaged, or no coefficient.
+    """
+    contents, _ = read_members(path, {VARIABLES: MAX_VARIABLES_BYTES})
+    variables = _read_tensors(path, VARIABLES, contents[VARIABLES]) if contents else {}
+    found = {name: variables[name] for name in _ENTROPY_SHAPES if name in variables}
+    for name, tensor in found.items():
+        coefficient = tensor.exp() if name == "log_ent_coef" else tensor
+        if tuple(tensor.shape) != _ENTROPY_SHAPES[name] or not 0 <= float(coefficient) < float("inf"):
+            raise AgentFileError(
+                f"{path}: {name} must be one number, and the coefficient finite and from 0 on."
+            )
+    return found
+
+
+def _read_tensors(path: Path, member: str, content: bytes) -> dict[str, th.Tensor]:
+    with naming(path, f"{member!r}"):
         if content.startswith(b"PK\x03\x04"):
-            _check_not_compressed(path, content)
+            _check_not_compressed(path, member, content)
         state = th.load(io.BytesIO(content), map_location="cpu", weights_only=True, mmap=False)
     if not isinstance(state, dict):
-        raise AgentFileError(f"{path}: 'policy.pth' must hold tensors by name, not a {type(state).__name__}.")
+        raise AgentFileError(f"{path}: {member!r} must hold tensors by name, not a {type(state).__name__}.")
     n_bytes = 0
     for name, tensor in state.items():
-        _check_kind(path, name, tensor)
+        _check_kind(path, member, name, tensor)
         n_bytes += tensor.numel() * tensor.element_size()
         # Tensors may share memory or repeat it, so a small file can claim any size.
         if n_bytes > len(content):
-            raise AgentFileError(f"{path}: the tensors of 'policy.pth' are larger than their file.")
+            raise AgentFileError(f"{path}: the tensors of {member!r} are larger than their file.")
     for name, tensor in state.items():
         if not bool(th.isfinite(tensor).all()):
             raise AgentFileError(f"{path}: tensor {name!r} has values that are infinite or not a number.")
     return {name: tensor.detach() for name, tensor in state.items()}
 
 
-def _check_not_compressed(path: Path, content: bytes) -> None:
+def _check_not_compressed(path: Path, member: str, content: bytes) -> None:
     """Refuse a torch file whose members, which torch stores as they are, claim to be larger than the file."""
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         if sum(info.file_size for info in archive.infolist()) > len(content):
-            raise AgentFileError(f"{path}: the members of 'policy.pth' are larger than their file.")
+            raise AgentFileError(f"{path}: the members of {member!r} are larger than their file.")
 
 
-def _check_kind(path: Path, name: Any, tensor: Any) -> None:
+def _check_kind(path: Path, member: str, name: Any, tensor: Any) -> None:
     if not isinstance(name, str) or type(tensor) not in (th.Tensor, nn.Parameter):
-        raise AgentFileError(
-            f"{path}: 'policy.pth' must hold only tensors by name; {str(name)[:80]!r} is not."
-        )
+        raise AgentFileError(f"{path}: {member!r} must hold only tensors by name; {str(name)[:80]!r} is not.")
     if tensor.dtype != th.float32 or tensor.layout != th.strided or tensor.device.type != "cpu":
         raise AgentFileError(
             f"{path}: tensor {name[:80]!r} must be dense float32, got {tensor.layout} {tensor.dtype} on "

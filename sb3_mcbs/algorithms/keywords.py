@@ -1,12 +1,13 @@
 """The settings of the search and of its schedule as parameters of constructors."""
 
 import inspect
+from collections.abc import Mapping
 from dataclasses import Field, fields
 from typing import Any, TypedDict
 
 from sb3_mcbs.algorithms.learned_model import EnsembleSettings
 from sb3_mcbs.algorithms.rollout_replay import RolloutReplaySettings
-from sb3_mcbs.search import ScheduleSettings, SearchSettings
+from sb3_mcbs.search import ScheduleSettings, SearchSettings, with_preset
 from sb3_mcbs.search.checks import CheckedSettings
 
 #: What an agent's constructor takes besides SB3's parameters, as attributes of the same names.
@@ -44,6 +45,10 @@ class SearchKeywords(TypedDict, total=False):
     n_rounds: int
     n_elites: int | None
     min_noise: float
+    entropy_bonus: bool
+    tqc_value: str
+    noise_hold: int
+    proposal_dims: int | None
     search_schedule: str
     search_share: float
     search_unit: str
@@ -85,6 +90,10 @@ class SearchAttributes:
     n_rounds: int
     n_elites: int | None
     min_noise: float
+    entropy_bonus: bool
+    tqc_value: str
+    noise_hold: int
+    proposal_dims: int | None
     search_schedule: str
     search_share: float
     search_unit: str
@@ -124,6 +133,28 @@ def list_search_settings(cls: type) -> None:
     if cls.__doc__:  # there is none under ``python -OO``
         before, _, _ = inspect.cleandoc(cls.__doc__).partition(f":param {_SEARCH_SETTINGS}:")
         cls.__doc__ = before + "".join(_parameters_documented(settings) for settings in SETTINGS)
+
+
+def complete_settings(
+    cls_name: str, given: Mapping[str, object], preset: str | None = None
+) -> dict[str, object]:
+    """All settings of an agent.
+
+    :param cls_name: of the agent, for errors.
+    :param given: those that its constructor was given.
+    :param preset: where the others start from, see :func:`~sb3_mcbs.search.with_preset`.
+    :return: the value of every field of :data:`SETTINGS`.
+    :raises TypeError: if there is no such setting.
+    :raises ValueError: if there is no such preset.
+    """
+    known = {field.name: field.default for field in setting_fields()}
+    unknown = sorted(given.keys() - known.keys())
+    if unknown:
+        raise TypeError(
+            f"{cls_name} got unexpected keyword arguments {unknown}; the settings of the search are "
+            f"{list(known)}."
+        )
+    return {**known, **with_preset(preset, given)}
 
 
 def setting_fields() -> list[Field]:

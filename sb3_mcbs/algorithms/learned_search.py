@@ -14,7 +14,14 @@ from sb3_mcbs.algorithms.vec_env_view import AgentView, reward_normalizer
 from sb3_mcbs.models.base import Observations
 from sb3_mcbs.models.ensemble import Transitions
 from sb3_mcbs.models.ensemble_model import EnsembleModel
-from sb3_mcbs.search import Moment, PlanMemory, SearchResult, SearchSettings, check_dynamics
+from sb3_mcbs.search import (
+    Moment,
+    PlanMemory,
+    RecentActions,
+    SearchResult,
+    SearchSettings,
+    check_dynamics,
+)
 from sb3_mcbs.search.interface import take_rows
 
 logger = logging.getLogger("sb3_mcbs")
@@ -25,6 +32,7 @@ def make_searcher(
     vec_env: VecEnv,
     settings: SearchSettings,
     normalize_reward: bool | None = None,
+    recent_actions: RecentActions | None = None,
 ) -> Searcher:
     """Make what searches for an agent.
 
@@ -32,10 +40,12 @@ def make_searcher(
     :param vec_env: the environments that it acts in.
     :param settings: settings of the search.
     :param normalize_reward: see :class:`~sb3_mcbs.SearchPolicy`.
+    :param recent_actions: what the agent executed, for ``proposal_dims``; ``None``: nothing yet.
     :return: a :class:`LearnedSearcher` where a learned model simulates, else a :class:`Searcher`.
     """
     learned = settings.forward_model == "ensemble" and settings.rollout_depth > 0
-    return (LearnedSearcher if learned else Searcher)(agent, vec_env, settings, normalize_reward)
+    searcher = LearnedSearcher if learned else Searcher
+    return searcher(agent, vec_env, settings, normalize_reward, recent_actions)
 
 
 class LearnedSearcher(Searcher):
@@ -48,6 +58,7 @@ class LearnedSearcher(Searcher):
     :param vec_env: the environments.
     :param settings: settings of the search.
     :param normalize_reward: see :class:`~sb3_mcbs.SearchPolicy`.
+    :param recent_actions: what the agent executed, for ``proposal_dims``; ``None``: nothing yet.
     :raises ValueError: if the agent has no learned model.
     """
 
@@ -67,7 +78,7 @@ class LearnedSearcher(Searcher):
         self._said_not_ready = False
         check_dynamics(self.settings, self.model.deterministic)
         if self.settings.strategy == "refine":
-            self._plans = PlanMemory(vec_env.num_envs, self.settings.rollout_depth, self._act_dim)
+            self._plans = PlanMemory(vec_env.num_envs, self.settings.horizon, self._act_dim)
 
     @property
     def _learned_model(self) -> LearnedModel:

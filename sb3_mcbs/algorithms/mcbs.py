@@ -10,6 +10,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
@@ -22,13 +23,20 @@ from sb3_mcbs.algorithms.faults import (
     leave_out_step,
     warn_of_divergence,
 )
-from sb3_mcbs.algorithms.keywords import SearchAttributes, list_search_settings, setting_fields
+from sb3_mcbs.algorithms.keywords import SearchAttributes, complete_settings, list_search_settings
 from sb3_mcbs.algorithms.learned_model import EnsembleSettings, LearnedModel, set_up_learned_model
 from sb3_mcbs.algorithms.learned_search import make_searcher
 from sb3_mcbs.algorithms.rollout_replay import RolloutReplay, RolloutReplaySettings, mixed_batches
 from sb3_mcbs.algorithms.searcher import Searcher
 from sb3_mcbs.algorithms.torch_settings import matmul_precision
-from sb3_mcbs.search import Rollouts, ScheduleSettings, SearchResult, SearchSchedule, SearchSettings
+from sb3_mcbs.search import (
+    RecentActions,
+    Rollouts,
+    ScheduleSettings,
+    SearchResult,
+    SearchSchedule,
+    SearchSettings,
+)
 
 SelfMCBS = TypeVar("SelfMCBS", bound="MCBS")
 
@@ -42,7 +50,7 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         class MCBSSAC(MCBS, SAC):
             def __init__(self, policy, env, ..., **search_settings: Unpack[SearchKeywords]) -> None:
                 super().__init__(policy, env, ..., _init_setup_model=False)
-                self._init_search(action_noise_after_search, search_settings)
+                self._init_search(action_noise_after_search, search_settings, preset)
                 if _init_setup_model:
                     self._setup_model()
 
@@ -54,27 +62,26 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         super().__init_subclass__(**kwargs)
         list_search_settings(cls)
 
-    def _init_search(self, action_noise_after_search: bool, settings: Mapping[str, object]) -> None:
+    def _init_search(
+        self, action_noise_after_search: bool, settings: Mapping[str, object], preset: str | None = None
+    ) -> None:
         """
         Take over the constructor's arguments for the search.
 
         :param action_noise_after_search: add ``action_noise`` to searched actions too
         :param settings: fields of :data:`SETTINGS`; those not given have their defaults
+        :param preset: where they start from, see :func:`~sb3_mcbs.search.with_preset`
         :raises TypeError: if there is no such setting
+        :raises ValueError: if there is no such preset
         """
-        known = {field.name: field.default for field in setting_fields()}
-        unknown = sorted(settings.keys() - known.keys())
-        if unknown:
-            raise TypeError(
-                f"{type(self).__name__} got unexpected keyword arguments {unknown}; the settings of the "
-                f"search are {list(known)}."
-            )
-        for name, default in known.items():
-            setattr(self, name, settings.get(name, default))
+        for name, value in complete_settings(type(self).__name__, settings, preset).items():
+            setattr(self, name, value)
+        self.preset = self._preset_taken_over = preset
         self.action_noise_after_search = action_noise_after_search
 
         self.search_rng: np.random.Generator | None = None
         self._schedule: SearchSchedule | None = None
+        self.recent_actions: RecentActions | None = None
         self.n_decisions = 0
         self.n_simulated_steps = 0
         self.n_invalid_rollouts = 0
@@ -100,6 +107,11 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
 
     def _setup_model(self) -> None:
         # ``load`` sets attributes without calling the constructor, so settings are checked here.
+        if self.preset != self._preset_taken_over:
+            raise ValueError(
+                f"preset={self.preset!r} is for constructors. Give the settings of a saved agent one by one: "
+                f"load(path, **PRESETS[{self.preset!r}])."
+            )
         settings, schedule = self.search_settings, self.schedule_settings
         schedule.check_search(settings)
         RolloutReplaySettings.of(self).check_search(settings)
@@ -113,6 +125,8 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         if self._schedule is None:
             self._schedule = SearchSchedule(schedule, self.seed)
         self._schedule.settings = schedule
+        if self.recent_actions is None and settings.proposal_dims is not None:
+            self.recent_actions = RecentActions(get_action_dim(self.action_space))
         if self.rollout_replay:
             assert self.replay_buffer is not None
             RolloutReplay(self.replay_buffer, *schedule.most_rollouts(settings))  # makes room in it
@@ -136,7 +150,7 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         # What this environment's VecNormalize does is what the critics learn from.
         normalizer = unwrap_vec_normalize(env)
         normalize_reward = normalizer is not None and normalizer.norm_reward
-        self._searcher = make_searcher(self, env, settings, normalize_reward)
+        self._searcher = make_searcher(self, env, settings, normalize_reward, self.recent_actions)
         if self.verbose >= 1:
             print(f"Forward model: {self._searcher.description}")
 
@@ -248,6 +262,9 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         if diverged:
             leave_out_step(self, replay_buffer, new_obs)
             return
+        if self.num_timesteps - self.n_envs >= self.learning_starts:  # random actions have no directions
+            assert self._searcher is not None
+            self._searcher.note_actions(buffer_action)
         if self._decision is not None:
             assert self._searcher is not None
             error = self._searcher.model_error(*self._decision, new_obs, raw_reward, infos)

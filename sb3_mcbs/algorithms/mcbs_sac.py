@@ -19,8 +19,8 @@ class MCBSSAC(MCBS, SAC):
 
     As :class:`~sb3_mcbs.MCBSTD3`, with the losses of SAC: ``matmul_precision`` holds for them too.
     Searched actions lie around the actor's mean action, not around one that the actor (or gSDE) drew, and
-    rollouts end with the minimum of the critics' values, without an entropy term. Before
-    ``learning_starts`` the agent acts as SAC does.
+    rollouts end with the minimum of the critics' values, without an entropy term unless ``entropy_bonus`` is
+    set. Before ``learning_starts`` the agent acts as SAC does.
 
     ``predict`` is the actor alone, without search, as for every SB3 algorithm: it needs no environment.
     To act with search use :class:`~sb3_mcbs.SearchPolicy`.
@@ -64,6 +64,8 @@ class MCBSSAC(MCBS, SAC):
     :param device: Device (cpu, cuda, ...) on which the networks run; simulation is on the CPU
     :param _init_setup_model: Whether or not to build the network at the creation of the instance
     :param action_noise_after_search: add ``action_noise`` to searched actions too
+    :param preset: a name of :data:`~sb3_mcbs.search.PRESETS`: where the search's settings start from. Those
+        that are given hold in any case.
     :param search_settings: the fields of :class:`~sb3_mcbs.SearchSettings` and
         :class:`~sb3_mcbs.search.ScheduleSettings`
     """
@@ -100,6 +102,7 @@ class MCBSSAC(MCBS, SAC):
         _init_setup_model: bool = True,
         *,
         action_noise_after_search: bool = False,
+        preset: str | None = None,
         **search_settings: Unpack[SearchKeywords],
     ) -> None:
         super().__init__(
@@ -132,7 +135,7 @@ class MCBSSAC(MCBS, SAC):
             device=device,
             _init_setup_model=False,
         )
-        self._init_search(action_noise_after_search, search_settings)
+        self._init_search(action_noise_after_search, search_settings, preset)
 
         if _init_setup_model:
             self._setup_model()

@@ -61,6 +61,8 @@ class MCBSTD3(MCBS, FastUpdate, TD3):
     :param action_noise_after_search: add ``action_noise`` to searched actions too
     :param fast_update: do gradient steps with SB3's mathematics but fewer instructions, where the networks
         are plain MLPs; others use SB3's own
+    :param preset: a name of :data:`~sb3_mcbs.search.PRESETS`: where the search's settings start from. Those
+        that are given hold in any case.
     :param search_settings: the fields of :class:`~sb3_mcbs.SearchSettings` and
         :class:`~sb3_mcbs.search.ScheduleSettings`
     """
@@ -95,6 +97,7 @@ class MCBSTD3(MCBS, FastUpdate, TD3):
         *,
         action_noise_after_search: bool = False,
         fast_update: bool = True,
+        preset: str | None = None,
         **search_settings: Unpack[SearchKeywords],
     ) -> None:
         super().__init__(
@@ -124,7 +127,7 @@ class MCBSTD3(MCBS, FastUpdate, TD3):
             device=device,
             _init_setup_model=False,
         )
-        self._init_search(action_noise_after_search, search_settings)
+        self._init_search(action_noise_after_search, search_settings, preset)
         self.fast_update = fast_update
 
         if _init_setup_model:

@@ -11,6 +11,7 @@ from sb3_contrib import TQC
 from sb3_contrib.tqc.policies import Actor as TQCActor
 from sb3_contrib.tqc.policies import Critic as TQCCritic
 from stable_baselines3 import DDPG, SAC, TD3
+from stable_baselines3.common.distributions import TanhBijector
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.preprocessing import is_image_space
@@ -22,6 +23,7 @@ from torch import nn
 
 from sb3_mcbs.algorithms.mlp import MLP
 from sb3_mcbs.models.base import Observations
+from sb3_mcbs.search import SearchSettings
 
 _T = TypeVar("_T")
 
@@ -42,6 +44,51 @@ def check_agent(agent: OffPolicyAlgorithm) -> None:
         )
     if not isinstance(agent.action_space, spaces.Box):
         raise ValueError(f"A search needs a continuous (Box) action space, got {agent.action_space}.")
+
+
+def check_values(agent: OffPolicyAlgorithm, settings: SearchSettings) -> None:
+    """Refuse settings of values that the agent's networks do not give.
+
+    :param agent: a supported agent.
+    :param settings: of the search.
+    :raises ValueError: says which setting, and why.
+    """
+    if settings.entropy_bonus:
+        entropy_coefficient(agent)
+    if settings.tqc_value == "truncated":
+        if not isinstance(agent, TQC):
+            raise ValueError(
+                f"tqc_value='truncated' is for TQC's quantiles; a {type(agent).__name__} has none. Leave it "
+                "out."
+            )
+        n_quantiles = agent.policy.critic.n_quantiles
+        if not 0 <= agent.top_quantiles_to_drop_per_net < n_quantiles:
+            raise ValueError(
+                "tqc_value='truncated' needs a top_quantiles_to_drop_per_net from 0 to below the number of "
+                f"quantiles, {n_quantiles}; got {agent.top_quantiles_to_drop_per_net}."
+            )
+
+
+def entropy_coefficient(agent: OffPolicyAlgorithm) -> float:
+    """What an agent's losses multiply the entropy with at present.
+
+    :param agent: a SAC or TQC agent.
+    :raises ValueError: if it is another one, or was loaded from a file that does not say it.
+    """
+    if not isinstance(agent, SAC | TQC):
+        raise ValueError(
+            f"entropy_bonus=True is for SAC and TQC: the actor of a {type(agent).__name__} is deterministic "
+            "and has no entropy. Leave it out."
+        )
+    # SB3 has one of the two: the first where the coefficient is learned.
+    if agent.log_ent_coef is not None:
+        return agent.log_ent_coef.detach().exp().item()
+    if getattr(agent, "ent_coef_tensor", None) is None:
+        raise ValueError(
+            "entropy_bonus=True needs the agent's entropy coefficient, which its file does not say. Set it: "
+            "agent.ent_coef_tensor = torch.tensor(0.1)."
+        )
+    return agent.ent_coef_tensor.item()
 
 
 def _check_plain(network: Any) -> None:
@@ -141,14 +188,25 @@ def policy_function(agent: OffPolicyAlgorithm) -> Callable[[Observations], np.nd
     return policy
 
 
-def value_function(agent: OffPolicyAlgorithm) -> Callable[[Observations, np.ndarray], np.ndarray]:
-    """The online critics' estimate: the minimum over critics, or TQC's mean over all quantiles.
+def value_function(
+    agent: OffPolicyAlgorithm, tqc_value: str = "mean"
+) -> Callable[[Observations, np.ndarray], np.ndarray]:
+    """The online critics' estimate: the minimum over critics, or TQC's mean over quantiles.
 
     :param agent: a supported agent; its present networks are used at every call.
+    :param tqc_value: which quantiles, see :class:`~sb3_mcbs.SearchSettings`.
     :return: observations ``[rows, *obs_shape]``, scaled actions ``[rows, act_dim]`` -> ``[rows]``.
     """
     policy_network: Any = agent.policy
     quantiles = isinstance(agent, TQC)
+
+    def mean_quantile(quantiles: th.Tensor, critic: Any) -> th.Tensor:
+        # ``[quantiles of all critics, rows]``
+        if tqc_value == "truncated":
+            n_dropped = agent.top_quantiles_to_drop_per_net * critic.n_critics  # type: ignore[attr-defined]
+            quantiles = quantiles.sort(dim=0).values[: len(quantiles) - n_dropped]
+        return quantiles.mean(dim=0)
+
     mlps_of = _if_plain(critic_mlps)
 
     def value(observations: Observations, actions: np.ndarray) -> np.ndarray:
@@ -159,13 +217,39 @@ def value_function(agent: OffPolicyAlgorithm) -> Callable[[Observations, np.ndar
             inputs = _columns(observations, actions, agent.device)
             columns = [mlp(inputs) for mlp in mlps]
             if quantiles:
-                return _to_numpy(th.cat(columns).mean(dim=0), agent.device)
+                return _to_numpy(mean_quantile(th.cat(columns), critic), agent.device)
             return _to_numpy(functools.reduce(th.minimum, columns)[0], agent.device)
         with th.no_grad():
             tensor = obs_as_tensor(observations, agent.device)
             estimates = critic(tensor, th.as_tensor(actions, device=agent.device))
             if quantiles:
-                return estimates.mean(dim=(1, 2)).cpu().numpy()
+                return mean_quantile(estimates.flatten(1).t(), critic).cpu().numpy()
             return th.cat(estimates, dim=1).amin(dim=1).cpu().numpy()
 
     return value
+
+
+def entropy_function(agent: OffPolicyAlgorithm) -> Callable[[Observations, np.ndarray], np.ndarray]:
+    """What actions add to the soft value: ``-ent_coef * log pi(a|s)``.
+
+    :param agent: a SAC or TQC agent; its present actor and entropy coefficient are used at every call.
+    :return: observations ``[rows, *obs_shape]``, scaled actions ``[rows, act_dim]`` -> ``[rows]``.
+    """
+    policy_network: Any = agent.policy
+
+    def bonus(observations: Observations, actions: np.ndarray) -> np.ndarray:
+        actor = policy_network.actor
+        with th.no_grad():
+            tensor = obs_as_tensor(observations, agent.device)
+            mean, log_std, more = actor.get_action_dist_params(tensor)
+            distribution = actor.action_dist.proba_distribution(mean, log_std, **more)
+            squashed = th.as_tensor(actions, device=agent.device)
+            if actor.use_sde:
+                log_prob = distribution.log_prob(squashed)
+            else:
+                # Where tanh is saturated its inverse is a guess; that of the policy's own action is known.
+                latent = th.where(squashed == th.tanh(mean), mean, TanhBijector.inverse(squashed))
+                log_prob = distribution.log_prob(squashed, latent)
+            return (-entropy_coefficient(agent) * log_prob).cpu().numpy()
+
+    return bonus

@@ -67,6 +67,10 @@ class RolloutReplaySettings(CheckedSettings):
                 "rollout_replay needs strategy='beam' without a time_budget: only there are rollouts those "
                 "of the actor, and equally many at every decision."
             )
+        if settings.noise_hold > 1:
+            raise ValueError(
+                "rollout_replay needs noise_hold=1: rollouts that hold noise do not follow the actor."
+            )
 
 
 class RolloutReplay:

@@ -1,5 +1,6 @@
 """Act with search with any trained agent."""
 
+from copy import deepcopy
 from dataclasses import replace
 from typing import Any
 
@@ -10,7 +11,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_mcbs.algorithms.learned_search import make_searcher
 from sb3_mcbs.algorithms.mcbs import MCBS
-from sb3_mcbs.search import SearchResult, SearchSettings
+from sb3_mcbs.search import SearchResult, SearchSettings, with_preset
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 
 
@@ -24,7 +25,7 @@ class SearchPolicy:
         policy = SearchPolicy(model, vec_env, beam_width=6, rollout_depth=3)
         evaluate_policy(policy, vec_env)
 
-    SAC and TQC propose their mean action; TQC's value is the mean over all quantiles of all critics.
+    SAC and TQC propose their mean action; TQC's value is the mean over quantiles that ``tqc_value`` says.
     Attributes that this class does not have are those of the agent (``save``, ``get_env``, ``logger``, ...).
 
     :param model: a TD3, DDPG, SAC or TQC agent, or one that searched in training (
@@ -35,8 +36,10 @@ class SearchPolicy:
     :param seed: seed of the search's own generator; None: a fresh one
     :param normalize_reward: whether the critics were trained on rewards that ``VecNormalize`` scaled.
         None: found out from the environment that the agent was trained in, or assumed from the statistics
+    :param preset: a name of :data:`~sb3_mcbs.search.PRESETS`: where the settings start from, instead of
+        those that the agent trained with
     :param search_settings: the fields of :class:`~sb3_mcbs.SearchSettings`; those not given are
-        those that the agent trained with, or the defaults
+        those that the agent trained with, or the preset's, or the defaults
     """
 
     def __init__(
@@ -45,6 +48,7 @@ class SearchPolicy:
         vec_env: VecEnv | gym.Env,
         seed: int | None = None,
         normalize_reward: bool | None = None,
+        preset: str | None = None,
         **search_settings: Any,
     ) -> None:
         unknown = sorted(set(search_settings) - set(SearchSettings.names()))
@@ -52,13 +56,17 @@ class SearchPolicy:
             raise TypeError(f"Unknown search settings {unknown}; known are {list(SearchSettings.names())}.")
         if normalize_reward is not None and not isinstance(normalize_reward, bool):
             raise TypeError(f"normalize_reward must be True, False or None, got {normalize_reward!r}.")
-        settings = model.search_settings if isinstance(model, MCBS) else SearchSettings()
         self.model = model
-        self.settings = replace(settings, **search_settings)
+        if preset is None and isinstance(model, MCBS):
+            self.settings = replace(model.search_settings, **search_settings)
+        else:
+            self.settings = SearchSettings(**with_preset(preset, search_settings))
         self.vec_env = _as_vec_env(vec_env)
         self.rng = np.random.default_rng(seed)
         self.last_result: SearchResult | None = None
-        self.searcher = make_searcher(model, self.vec_env, self.settings, normalize_reward)
+        # A copy, so that acting elsewhere does not change the training.
+        recent_actions = deepcopy(model.recent_actions) if isinstance(model, MCBS) else None
+        self.searcher = make_searcher(model, self.vec_env, self.settings, normalize_reward, recent_actions)
 
     def predict(
         self,
@@ -81,6 +89,7 @@ class SearchPolicy:
         space = self.model.observation_space
         batched, is_single = _add_batch_axis(observation, space)
         self.last_result = self.searcher.search(batched, self.rng)
+        self.searcher.note_actions(self.last_result.actions)
         actions = self.searcher.unscale(self.last_result.actions)
         return (actions[0] if is_single else actions), state
 

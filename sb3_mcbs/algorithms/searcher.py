@@ -12,7 +12,14 @@ from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_mcbs.algorithms.faults import NonFiniteError, check_observations, is_finite
-from sb3_mcbs.algorithms.networks import check_agent, policy_function, value_function
+from sb3_mcbs.algorithms.networks import (
+    check_agent,
+    check_values,
+    entropy_function,
+    policy_function,
+    value_function,
+)
+from sb3_mcbs.algorithms.observations import difference, equal, n_rows, row_of
 from sb3_mcbs.algorithms.torch_settings import matmul_precision, one_thread
 from sb3_mcbs.algorithms.vec_env_view import (
     AgentView,
@@ -29,6 +36,7 @@ from sb3_mcbs.search import (
     Moment,
     Pace,
     PlanMemory,
+    RecentActions,
     SearchResult,
     SearchSettings,
     check_dynamics,
@@ -48,9 +56,11 @@ class Searcher:
     :param vec_env: the environments; those in this process are wrapped in place.
     :param settings: settings of the search.
     :param normalize_reward: see :class:`~sb3_mcbs.SearchPolicy`.
+    :param recent_actions: what the agent executed, for ``proposal_dims``; ``None``: nothing yet.
     :raises SnapshotUnsupportedError: if an environment's state cannot be captured.
     :raises ForwardModelError: if the requested forward model cannot simulate the environments.
-    :raises ValueError: if the settings make no sense with the environments' random dynamics.
+    :raises ValueError: if the settings make no sense with the agent, its actions or the environments' random
+        dynamics.
     """
 
     def __init__(
@@ -59,12 +69,20 @@ class Searcher:
         vec_env: VecEnv,
         settings: SearchSettings,
         normalize_reward: bool | None = None,
+        recent_actions: RecentActions | None = None,
     ) -> None:
         check_agent(agent)
+        check_values(agent, settings)
         self.agent = agent
         self.settings = settings
         self._action_shape = agent.action_space.shape or ()
         self._act_dim = get_action_dim(agent.action_space)
+        if (settings.proposal_dims or 0) > self._act_dim:
+            raise ValueError(
+                f"proposal_dims must be at most {self._act_dim}, the entries of an action here; got "
+                f"{settings.proposal_dims}."
+            )
+        self.recent_actions = RecentActions(self._act_dim) if recent_actions is None else recent_actions
         space: Any = agent.action_space
         known = type(agent.policy).unscale_action is BasePolicy.unscale_action and space.dtype == np.float32
         self._low, self._half_range = space.low, 0.5 * (space.high - space.low) if known else None
@@ -87,7 +105,7 @@ class Searcher:
         self.model = make_forward_model(self.environments, settings.forward_model, settings.n_threads)
         check_dynamics(settings, self.model.deterministic)
         if settings.strategy == "refine":
-            self._plans = PlanMemory(len(self.environments), settings.rollout_depth, self._act_dim)
+            self._plans = PlanMemory(len(self.environments), settings.horizon, self._act_dim)
 
     @property
     def ready(self) -> bool:
@@ -130,12 +148,13 @@ class Searcher:
         elif envs is not None:
             observations = take_rows(observations, np.asarray(envs))
         agent, settings = self.agent_functions(), effort or self.settings
+        dims = settings.proposal_dims
+        directions = None if dims is None else self.recent_actions.directions(dims)
         with one_thread(), matmul_precision(settings.matmul_precision):
             if settings.time_budget is None:
-                shape = (_n_rows(observations), self._act_dim)
-                decision = Decision(
-                    self.model, roots, observations, agent, settings, shape, rng, record=record
-                )
+                shape = (n_rows(observations), self._act_dim)
+                decision = Decision(self.model, roots, observations, agent, settings, shape, rng)
+                decision = decision._replace(record=record, directions=directions)
                 if self._plans is not None:
                     assert envs is not None
                     decision = decision._replace(memory=self._plans, envs=envs, moments=self._moments(envs))
@@ -144,7 +163,7 @@ class Searcher:
                 assert self.model is not None
                 deadline = start + settings.time_budget
                 result = deadline_search(
-                    self.model, roots, observations, agent, settings, deadline, self._pace, rng
+                    self.model, roots, observations, agent, settings, deadline, self._pace, rng, directions
                 )
         if result.invalid_rollouts or not is_finite(result.actions):
             _check_networks(agent.policy, agent.value, observations)
@@ -167,6 +186,14 @@ class Searcher:
             lambda array: array.reshape(*shape, *array.shape[1:]), self.view.observe(rows, normalize=False)
         )
         return result._replace(rollouts=rollouts._replace(observations=observations))
+
+    def note_actions(self, actions: np.ndarray) -> None:
+        """Remember what is executed, if the search learns directions from it.
+
+        :param actions: ``[n, *]``, scaled.
+        """
+        if self.settings.proposal_dims is not None:
+            self.recent_actions.note(actions.reshape(len(actions), -1))
 
     def model_error(
         self,
@@ -197,11 +224,11 @@ class Searcher:
             env = envs[row]
             real = infos[env].get("terminal_observation")
             if real is None:
-                real = _row(observations, env)
-            error = max(error, _difference(_row(predicted, row), real))
+                real = row_of(observations, env)
+            error = max(error, difference(row_of(predicted, row), real))
             # A vectorized environment hands rewards on as float32.
             error = max(
-                error, _difference(np.float32(result.first_step.rewards[row]), np.float32(rewards[env]))
+                error, difference(np.float32(result.first_step.rewards[row]), np.float32(rewards[env]))
             )
         if error > 0:
             self._follow_environment(f"The forward model's prediction differs from reality by {error:.3g}. ")
@@ -217,11 +244,14 @@ class Searcher:
             "deterministic": None if model is None else model.deterministic,
             "previous_step_differed": self._previous_step_differed,
             "plans": None if self._plans is None else self._plans.state(self._moments(self._all_envs)),
+            "recent_actions": None if self.settings.proposal_dims is None else self.recent_actions.state(),
         }
 
     @memory.setter
     def memory(self, memory: dict[str, Any]) -> None:
         self._previous_step_differed = memory["previous_step_differed"]
+        if memory.get("recent_actions") is not None:
+            self.recent_actions.set_state(memory["recent_actions"])
         if self.model is None:
             return
         if self._plans is not None and memory.get("plans") is not None:
@@ -243,16 +273,23 @@ class Searcher:
         return self._functions._replace(gamma=self.agent.gamma)
 
     def _agent_functions(self) -> Agent:
-        policy, value, gamma = policy_function(self.agent), value_function(self.agent), self.agent.gamma
+        policy, gamma = policy_function(self.agent), self.agent.gamma
+        value = value_function(self.agent, self.settings.tqc_value)
         if self.model is None:
             return Agent(policy, value, gamma, self.unscale, lambda rewards: rewards)
         observe = self.view.observe
-        return Agent(
+        agent = Agent(
             policy=lambda observations: policy(observe(observations)),
             value=lambda observations, actions: value(observe(observations), actions),
             gamma=gamma,
             unscale_action=self.unscale,
             scale_reward=self.view.scale_reward,
+        )
+        if not self.settings.entropy_bonus:
+            return agent
+        bonus = entropy_function(self.agent)
+        return agent._replace(
+            entropy_bonus=lambda observations, actions: bonus(observe(observations), actions)
         )
 
     def unscale(self, actions: np.ndarray) -> np.ndarray:
@@ -289,7 +326,7 @@ class Searcher:
         if any(observation is None for observation in present):
             raise ValueError("Reset the vectorized environment before the first search.")
         stacked = stack(present)
-        if not _equal(self.view.observe(stacked), observations):
+        if not equal(self.view.observe(stacked), observations):
             check_observations(stacked)  # NaN is not equal to itself
             raise ValueError(
                 "The observations to act on are not those of the environments' present states. A search "
@@ -376,31 +413,3 @@ def _last_observation(env: SnapshotEnvWrapper) -> Any:
 
 def _moment(env: SnapshotEnvWrapper) -> Moment:
     return env.moment
-
-
-def _row(observations: Observations, index: int) -> Any:
-    if isinstance(observations, dict):
-        return {key: value[index] for key, value in observations.items()}
-    return observations[index]
-
-
-def _n_rows(observations: Observations) -> int:
-    return len(next(iter(observations.values()))) if isinstance(observations, dict) else len(observations)
-
-
-def _equal(left: Observations, right: Observations) -> bool:
-    if isinstance(left, dict):
-        return isinstance(right, dict) and all(np.array_equal(left[key], right[key]) for key in left)
-    # What np.array_equal does, without its Python.
-    return not isinstance(right, dict) and left.shape == right.shape and bool((left == right).all())
-
-
-def _difference(left: Any, right: Any) -> float:
-    """Largest absolute difference; two NaNs are equal, a NaN and a number are infinitely far apart."""
-    if isinstance(left, dict):
-        return max(_difference(left[key], right[key]) for key in left)
-    left, right = np.asarray(left, np.float64), np.asarray(right, np.float64)
-    if np.array_equal(left, right, equal_nan=True):
-        return 0.0
-    difference = np.abs(left - right)
-    return float(np.where(np.isnan(difference), np.inf, difference).max())

@@ -2,11 +2,12 @@
 
 from sb3_mcbs.search.beam import beam_search
 from sb3_mcbs.search.deadline import Pace, deadline_search
+from sb3_mcbs.search.directions import RecentActions
 from sb3_mcbs.search.interface import Agent, FirstStep, Rollouts, SearchResult
 from sb3_mcbs.search.memory import Moment, PlanMemory
 from sb3_mcbs.search.proposals import Noise, draw_noise
 from sb3_mcbs.search.schedule import ScheduleSettings, SearchSchedule
-from sb3_mcbs.search.settings import PRESETS, SearchSettings
+from sb3_mcbs.search.settings import PRESETS, SearchSettings, with_preset
 from sb3_mcbs.search.strategies import Decision, check_dynamics, search
 
 __all__ = [
@@ -18,6 +19,7 @@ __all__ = [
     "Noise",
     "Pace",
     "PlanMemory",
+    "RecentActions",
     "Rollouts",
     "ScheduleSettings",
     "SearchResult",
@@ -28,4 +30,5 @@ __all__ = [
     "deadline_search",
     "draw_noise",
     "search",
+    "with_preset",
 ]

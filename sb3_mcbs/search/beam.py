@@ -25,6 +25,7 @@ from sb3_mcbs.search.proposals import (
     critic_values,
     preselect,
     propose,
+    without_first,
 )
 from sb3_mcbs.search.settings import SearchSettings
 
@@ -65,19 +66,24 @@ def beam_search(
     :return: actions, and what the search found.
     """
     policy_actions = agent.policy(observations)
+    if settings.include_policy_action:
+        noise = noise._replace(beam=without_first(noise.beam))
     candidates = propose(policy_actions, noise.beam, settings.include_policy_action)
     if settings.n_proposals is not None:
         by_critics = critic_values(observations, candidates, agent)
         kept = preselect(by_critics, settings.beam_width, always=int(settings.include_policy_action))
         candidates = np.take_along_axis(candidates, kept[..., None], axis=1)
+        noise = noise._replace(beam=np.take_along_axis(noise.beam, kept[..., None], axis=1))
     if settings.rollout_depth == 0:
         values = critic_values(observations, candidates, agent)[..., None]
         return choose(policy_actions, candidates, values, None, 0)
     assert model is not None, "a rollout needs a forward model"
-    recorder = RolloutRecorder(settings.rollout_depth) if record else None
+    recorder = RolloutRecorder(settings.horizon) if record else None
     evaluated = rollout_values(model, roots, candidates, agent, settings, noise, rng, recorder=recorder)
     result = choose(policy_actions, candidates, *evaluated)
-    return result if recorder is None else result._replace(rollouts=recorder.rollouts(candidates))
+    if recorder is None:
+        return result
+    return result._replace(rollouts=recorder.rollouts(candidates, evaluated[0].shape[2]))
 
 
 def choose(
@@ -135,13 +141,12 @@ def rollout_values(
 ) -> tuple[np.ndarray, FirstStep, int]:
     """Evaluate ShortHorizon for every environment, candidate and simulation (Algorithm 1, step 2).
 
-    All rollouts advance together. The forward model holds one row for each of the ``unfinished``
-    rollouts, in order, and then ``row_of`` is None; otherwise ``row_of`` says which row is whose:
-    the simulations of a candidate share one in the first step of a deterministic environment, and
-    rows of rollouts that ended are not yet dropped.
+    All rollouts advance together; the forward model holds one row for each of the ``unfinished`` ones, in
+    order. In a deterministic environment the simulations of a candidate are one until their noise differs,
+    after the first macro-step: until then a row stands for ``shared`` of them.
 
     :param candidates: ``[n_envs, beam, act_dim]``.
-    :param noise: of ``beam`` candidates at least.
+    :param noise: of those candidates: 0 where one is the policy's own action.
     :param out_of_time: asked before every step; True gives up.
     :param recorder: is told every step.
     :return: values ``[n_envs, beam, sim]`` in float64 (NaN where a simulation was invalid), the first step of
@@ -149,106 +154,138 @@ def rollout_values(
     :raises OutOfTimeError: if it gave up.
     """
     n_envs, beam, act_dim = candidates.shape
-    depth_limit, n_sim = settings.rollout_depth, settings.distinct_simulations(model.deterministic)
-    n_first = 1 if model.deterministic else n_sim
-    n_rollouts = n_envs * beam * n_sim
-    rollout_noise = noise.rollout[:, :, :, :n_sim].reshape(depth_limit, n_rollouts, act_dim)
+    hold, n_sim = settings.noise_hold, settings.distinct_simulations(model.deterministic)
+    shared = n_sim if model.deterministic else 1
+    n_first = n_sim // shared
+    first_noise = np.repeat(noise.beam.reshape(-1, act_dim), n_first, axis=0)
+    later_noise = noise.rollout[:, :, :, :n_sim].reshape(-1, n_envs * beam * n_sim, act_dim)
 
-    returns = np.zeros(n_rollouts)
+    returns = np.zeros(n_envs * beam * n_first)
     unfinished: np.ndarray | slice = _ALL
-    row_of = np.arange(n_rollouts) // n_sim if n_first < n_sim else None
     discount = 1.0
     simulated_steps = 0
-
     model.set_roots(roots, np.repeat(np.arange(n_envs), beam * n_first), rng)
     actions = np.repeat(candidates.reshape(-1, act_dim), n_first, axis=0)
-    for depth in range(depth_limit):
+    for step_number in range(1, settings.horizon + 1):
         if out_of_time():
             raise OutOfTimeError(simulated_steps)
         step = model.step(agent.unscale_action(actions))
         observations = step.observations
         simulated_steps += len(actions)
-        if depth == 0:
+        if step_number == 1:
+            every_candidate = slice(None, None, n_first)
             first_step = FirstStep(
-                take_rows(observations, slice(None, None, n_first)), step.rewards[::n_first].copy()
+                take_rows(observations, every_candidate), step.rewards[every_candidate].copy()
             )
         if recorder is not None:
-            recorder.note_step(step, unfinished, row_of, n_rollouts)
+            recorder.note_step(step, unfinished)
         rewards = agent.scale_reward(step.rewards)
         all_valid = step.valid.all()
         if not all_valid:
             rewards = np.where(step.valid, rewards, np.nan)
-        returns[unfinished] += discount * _spread(rewards, row_of)
+        returns[unfinished] += discount * rewards
         discount *= agent.gamma
 
-        # Simulations of one candidate share their first observation: the policy sees it once.
-        observation_of = row_of
+        rows: np.ndarray | None = None  # which of the model's rows go on, if not all as they are
         if not all_valid or step.terminated.any():
-            open_rows = step.valid & ~step.terminated
-            rows = np.arange(len(open_rows)) if row_of is None else row_of
-            still_open = open_rows[rows]
-            row_of = rows[still_open]
-            unfinished = np.arange(n_rollouts)[unfinished][still_open]
-            if not len(row_of):
+            rows = np.flatnonzero(step.valid & ~step.terminated)
+            if not len(rows):
                 break
-            observations = take_rows(observations, open_rows)
-            observation_of = (np.cumsum(open_rows) - 1)[row_of]
-        actions = _spread(agent.policy(observations), observation_of)
-        actions = clip_actions(actions + rollout_noise[depth, unfinished])
-        if depth + 1 < depth_limit:
-            if row_of is not None:
-                model.select(row_of)
-                row_of = None
-        else:
-            if observation_of is not None:
-                observations = take_rows(observations, observation_of)
-            returns[unfinished] += discount * agent.value(observations, actions).astype(np.float64)
-    return returns.reshape(n_envs, beam, n_sim), first_step, simulated_steps
+            unfinished = np.arange(len(returns))[unfinished][rows]
+            observations = take_rows(observations, rows)
+        # Simulations that are still one: the policy sees their observation once.
+        actions = agent.policy(observations)
+        is_last = step_number == settings.horizon
+        if step_number == hold and shared > 1:
+            if recorder is not None:
+                recorder.split(shared)
+            returns, actions = np.repeat(returns, shared), np.repeat(actions, shared, axis=0)
+            if unfinished is not _ALL:
+                unfinished = _split(unfinished, shared)
+            rows = np.repeat(np.arange(len(actions) // shared) if rows is None else rows, shared)
+            if is_last or agent.entropy_bonus is not None:
+                observations = take_rows(observations, np.arange(len(actions)) // shared)
+        held = first_noise if step_number < hold else later_noise[step_number // hold - 1]
+        actions = clip_actions(actions + held[unfinished])
+        if is_last or agent.entropy_bonus is not None:
+            returns[unfinished] += discount * _beyond_rewards(agent, observations, actions, is_last)
+        if not is_last and rows is not None:
+            model.select(rows)
+    return _of_simulations(returns, n_envs, beam, n_sim), first_step, simulated_steps
+
+
+def _split(index: Any, into: int) -> np.ndarray:
+    """The places of what each of some rows became."""
+    return (index[:, None] * into + np.arange(into)).ravel()
+
+
+def _of_simulations(values: np.ndarray, n_envs: int, beam: int, n_sim: int) -> np.ndarray:
+    """Give every simulation its value, also those that ended before they differed."""
+    values = np.repeat(values, n_envs * beam * n_sim // len(values), axis=0)
+    return values.reshape(n_envs, beam, n_sim, *values.shape[1:])
+
+
+def _beyond_rewards(agent: Agent, observations: Observations, actions: np.ndarray, is_last: bool) -> Any:
+    """What an action after the first is worth beside its rewards, in float64.
+
+    :param is_last: whether the critics' value closes the rollout.
+    :return: ``[rows]``.
+    """
+    worth = agent.value(observations, actions).astype(np.float64) if is_last else 0.0
+    if agent.entropy_bonus is not None:
+        worth = worth + agent.entropy_bonus(observations, actions).astype(np.float64)
+    return worth
 
 
 class RolloutRecorder:
     """Keeps what rollouts went through.
 
-    :param rollout_depth: steps of a rollout.
+    :param horizon: steps of a rollout.
     """
 
-    def __init__(self, rollout_depth: int) -> None:
-        self._depth_limit = rollout_depth
+    def __init__(self, horizon: int) -> None:
+        self._horizon = horizon
         self._depth = 0
 
-    def note_step(
-        self, step: Transition, unfinished: np.ndarray | slice, row_of: np.ndarray | None, n_rollouts: int
-    ) -> None:
+    def note_step(self, step: Transition, unfinished: np.ndarray | slice) -> None:
         """Keep a step of all rollouts that go on.
 
         :param step: ``[rows]``.
         :param unfinished: which rollouts those are.
-        :param row_of: the row of each; ``None`` if rows are in the order of ``unfinished``.
-        :param n_rollouts: of all environments.
         """
-        rows = np.arange(len(step.rewards)) if row_of is None else row_of
         if self._depth == 0:
-            self._rewards = np.zeros((n_rollouts, self._depth_limit))
+            n_rollouts = len(step.rewards)
+            self._rewards = np.zeros((n_rollouts, self._horizon))
             self._lengths = np.zeros(n_rollouts, dtype=int)
             self._terminated = np.zeros(n_rollouts, dtype=bool)
-            self._observations = take_rows(step.observations, rows)
+            self._observations = take_rows(step.observations, _ALL)
         else:
-            put_rows(self._observations, unfinished, step.observations, rows)
-        self._rewards[unfinished, self._depth] = step.rewards[rows]
-        self._lengths[unfinished] = np.where(step.valid[rows], self._depth + 1, 0)
-        self._terminated[unfinished] = step.terminated[rows]
+            put_rows(self._observations, unfinished, step.observations, _ALL)
+        self._rewards[unfinished, self._depth] = step.rewards
+        self._lengths[unfinished] = np.where(step.valid, self._depth + 1, 0)
+        self._terminated[unfinished] = step.terminated
         self._depth += 1
 
-    def rollouts(self, candidates: np.ndarray) -> Rollouts:
+    def split(self, into: int) -> None:
+        """Every rollout becomes several.
+
+        :param into: how many.
+        """
+        self._rewards = np.repeat(self._rewards, into, axis=0)
+        self._lengths = np.repeat(self._lengths, into)
+        self._terminated = np.repeat(self._terminated, into)
+        self._observations = map_arrays(lambda array: np.repeat(array, into, axis=0), self._observations)
+
+    def rollouts(self, candidates: np.ndarray, n_sim: int) -> Rollouts:
         """All of them.
 
         :param candidates: ``[n_envs, beam, act_dim]``, their first actions.
+        :param n_sim: simulations of each.
         """
         n_envs, beam = candidates.shape[:2]
-        n_sim = len(self._lengths) // (n_envs * beam)
 
         def by_env(array: np.ndarray) -> np.ndarray:
-            return array.reshape(n_envs, beam * n_sim, *array.shape[1:])
+            return _of_simulations(array, n_envs, beam, n_sim).reshape(n_envs, -1, *array.shape[1:])
 
         return Rollouts(
             np.repeat(candidates, n_sim, axis=1),
@@ -278,10 +315,6 @@ def join_rounds(first_steps: list[FirstStep], n_envs: int) -> FirstStep:
         else join(seen)
     )
     return FirstStep(observations, join([step.rewards for step in first_steps]))
-
-
-def _spread(values: np.ndarray, index: np.ndarray | None) -> np.ndarray:
-    return values if index is None else values[index]
 
 
 def _take_first_step(first_step: FirstStep, index: np.ndarray) -> FirstStep:

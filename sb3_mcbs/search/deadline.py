@@ -10,7 +10,7 @@ import numpy as np
 from sb3_mcbs.models.base import ForwardModel, Observations
 from sb3_mcbs.search.beam import OutOfTimeError, choose, join_rounds, rollout_values
 from sb3_mcbs.search.interface import Agent, FirstStep, SearchResult
-from sb3_mcbs.search.proposals import draw_noise, propose
+from sb3_mcbs.search.proposals import draw_noise, propose, without_first
 from sb3_mcbs.search.settings import SearchSettings
 
 #: How many past durations a forecast looks at, and which share of them it covers: of rounds, and of single
@@ -155,6 +155,7 @@ def deadline_search(
     deadline: float,
     pace: Pace,
     rng: np.random.Generator,
+    directions: np.ndarray | None = None,
 ) -> SearchResult:
     """Choose one action per environment from as many candidates as there is time for.
 
@@ -169,6 +170,7 @@ def deadline_search(
     :param deadline: when to be done, on the clock of ``pace``.
     :param pace: forecasts of this search, kept from decision to decision.
     :param rng: of the search: draws the noise, and is given to a model with random dynamics.
+    :param directions: ``[proposal_dims, act_dim]``, in which candidates differ; ``None``: in all.
     :return: actions, and what the search found.
     """
     policy_actions = agent.policy(observations)
@@ -183,8 +185,11 @@ def deadline_search(
         if width == 0:
             break
         watch = _Watch(pace, width, deadline)
-        noise = draw_noise(rng, settings, n_envs, act_dim, beam_width=width)
-        proposed = propose(policy_actions, noise.beam, settings.include_policy_action and done == 0)
+        noise = draw_noise(rng, settings, n_envs, act_dim, width, directions)
+        with_policy = settings.include_policy_action and done == 0
+        if with_policy:
+            noise = noise._replace(beam=without_first(noise.beam))
+        proposed = propose(policy_actions, noise.beam, with_policy)
         try:
             round_values, first_step, steps = rollout_values(
                 model, roots, proposed, agent, settings, noise, rng, out_of_time=watch

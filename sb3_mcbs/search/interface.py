@@ -22,6 +22,8 @@ class Agent(NamedTuple):
     :param gamma: discount factor per environment step.
     :param unscale_action: scaled actions ``[rows, act_dim]`` -> actions of the environment.
     :param scale_reward: rewards of the environment ``[rows]`` -> the scale that the critics know.
+    :param entropy_bonus: observations ``[rows, ...]``, scaled actions ``[rows, act_dim]`` -> what the actions
+        add to the value by being random, ``-ent_coef * log pi(a|s)``, ``[rows]``. ``None``: nothing.
     """
 
     policy: Callable[[Observations], np.ndarray]
@@ -29,6 +31,7 @@ class Agent(NamedTuple):
     gamma: float
     unscale_action: Callable[[np.ndarray], np.ndarray]
     scale_reward: Callable[[np.ndarray], np.ndarray]
+    entropy_bonus: Callable[[Observations, np.ndarray], np.ndarray] | None = None
 
 
 class FirstStep(NamedTuple):

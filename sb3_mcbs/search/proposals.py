@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_mcbs.models.base import Observations
+from sb3_mcbs.search.directions import low_dimensional
 from sb3_mcbs.search.interface import Agent, take_rows
 from sb3_mcbs.search.settings import SearchSettings
 
@@ -16,8 +17,9 @@ from sb3_mcbs.search.settings import SearchSettings
 class Noise(NamedTuple):
     """All random numbers of one decision by Algorithm 1.
 
-    :param beam: ``[n_envs, proposals, act_dim]``, eta_i in Algorithm 1.
-    :param rollout: ``[rollout_depth, n_envs, beam, sim, act_dim]``, eta in ShortHorizon.
+    :param beam: ``[n_envs, proposals, act_dim]``, eta_i in Algorithm 1; that of the first macro-step.
+    :param rollout: ``[rollout_depth, n_envs, beam, sim, act_dim]``, eta in ShortHorizon; that of the later
+        macro-steps and of the action that closes the rollout.
     """
 
     beam: np.ndarray
@@ -30,6 +32,7 @@ def draw_noise(
     n_envs: int,
     act_dim: int,
     beam_width: int | None = None,
+    directions: np.ndarray | None = None,
 ) -> Noise:
     """Draw the noise of one decision: first that of the candidates, then that of the rollouts.
 
@@ -38,6 +41,7 @@ def draw_noise(
     :param n_envs: number of environments.
     :param act_dim: entries of one action.
     :param beam_width: candidates; ``None``: as many as the settings say.
+    :param directions: ``[proposal_dims, act_dim]``, in which candidates differ; ``None``: in all.
     :return: the noise, clipped to ``noise_clip`` if that is set.
     """
     b, d, n = beam_width or settings.beam_width, settings.rollout_depth, settings.n_simulations
@@ -46,9 +50,8 @@ def draw_noise(
     beam = draw_normal(rng, (n_envs, n_proposals, act_dim), 1 if pairs else None)
     shape = (d, n_envs, 1 if settings.common_noise else b, n, act_dim)
     rollout = scale(draw_normal(rng, shape, 3 if pairs else None), settings.effective_rollout_noise, settings)
-    return Noise(
-        scale(beam, settings.beam_noise, settings), np.broadcast_to(rollout, (d, n_envs, b, n, act_dim))
-    )
+    beam = scale(low_dimensional(beam, directions), settings.beam_noise, settings)
+    return Noise(beam, np.broadcast_to(rollout, (d, n_envs, b, n, act_dim)))
 
 
 def draw_normal(rng: np.random.Generator, shape: tuple[int, ...], pairs: int | None) -> np.ndarray:
@@ -99,6 +102,17 @@ def propose(policy_actions: np.ndarray, noise: np.ndarray, include_policy_action
     if include_policy_action:
         candidates[:, 0] = policy_actions
     return candidates
+
+
+def without_first(noise: np.ndarray) -> np.ndarray:
+    """Noise of candidates of which the first is the policy's own action.
+
+    :param noise: ``[n_envs, beam, act_dim]``.
+    :return: a copy, 0 for the first.
+    """
+    noise = noise.copy()
+    noise[:, 0] = 0
+    return noise
 
 
 def preselect(values: np.ndarray, keep: int, always: int) -> np.ndarray:

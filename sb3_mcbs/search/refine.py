@@ -2,7 +2,8 @@
 
 A candidate is a *plan*: what is added to the policy's action at each of the next ``rollout_depth`` steps,
 ``a_t = clip(pi(s_t) + plan_t, -1, 1)``. Plans are rolled out as Algorithm 1 rolls out its candidates, only
-that the noise of later steps belongs to the plan.
+that the noise of later steps belongs to the plan. With ``noise_hold`` above 1 a plan has one offset for each
+macro-step, and axes of ``rollout_depth`` count those.
 """
 
 from collections.abc import Sequence
@@ -12,6 +13,7 @@ import numpy as np
 
 from sb3_mcbs.models.base import ForwardModel, Observations
 from sb3_mcbs.search.beam import choose, join_rounds, mean_values, rollout_values
+from sb3_mcbs.search.directions import combine, gain
 from sb3_mcbs.search.interface import Agent, FirstStep, SearchResult
 from sb3_mcbs.search.proposals import Noise, best, critic_values, draw_normal, preselect, propose, scale
 from sb3_mcbs.search.settings import SearchSettings
@@ -21,7 +23,8 @@ class Plans(NamedTuple):
     """What plans are drawn from: independent Gaussians.
 
     :param mean: ``[n_envs, rollout_depth, act_dim]``.
-    :param spread: ``[n_envs, rollout_depth, act_dim]``, standard deviations.
+    :param spread: ``[n_envs, rollout_depth, act_dim]``, standard deviations; with ``directions`` along those,
+        ``[n_envs, rollout_depth, proposal_dims]``.
     """
 
     mean: np.ndarray
@@ -53,6 +56,7 @@ def refine_search(
     noise: np.ndarray,
     rng: np.random.Generator,
     remembered: np.ndarray,
+    directions: np.ndarray | None = None,
 ) -> tuple[SearchResult, np.ndarray]:
     """Choose one action per environment: the first action of the best plan of all rounds.
 
@@ -64,11 +68,14 @@ def refine_search(
     :param noise: from :func:`draw_plan_noise`.
     :param rng: given to a model with random dynamics.
     :param remembered: ``[n_envs, rollout_depth, act_dim]``, the plans to start around; 0 is the policy.
+    :param directions: ``[proposal_dims, act_dim]``, in which plans differ from their mean; ``None``: in all.
     :return: the actions and what the search found, and the plans that the actions are from,
         ``[n_envs, rollout_depth, act_dim]``; 0 where none was valid.
     """
     policy_actions = agent.policy(observations)
-    source = Plans(remembered, np.broadcast_to(first_spread(settings), remembered.shape))
+    dims = remembered.shape[2] if directions is None else len(directions)
+    beginning = first_spread(settings) * np.float32(gain(directions))
+    source = Plans(remembered, np.broadcast_to(beginning, (*remembered.shape[:2], dims)))
     plans: list[np.ndarray] = []
     candidates: list[np.ndarray] = []
     values: list[np.ndarray] = []
@@ -76,8 +83,10 @@ def refine_search(
     simulated_steps = 0
     for number, round_noise in enumerate(noise):
         if number:
-            source = refit(source, np.concatenate(plans, axis=1), np.concatenate(values, axis=1), settings)
-        drawn = source.mean[:, None] + scale(round_noise, source.spread[:, None], settings)
+            known = np.concatenate(plans, axis=1), np.concatenate(values, axis=1)
+            source = refit(source, *known, settings, beginning, directions)
+        offsets = combine(round_noise[..., :dims] * source.spread[:, None], directions)
+        drawn = source.mean[:, None] + scale(offsets, 1.0, settings)
         always = _put_first(drawn, source.mean, settings.include_policy_action and number == 0)
         proposed = propose(policy_actions, drawn[:, :, 0], include_policy_action=False)
         if settings.n_proposals is not None:
@@ -114,13 +123,22 @@ def first_spread(settings: SearchSettings) -> np.ndarray:
     return spread
 
 
-def refit(source: Plans, plans: np.ndarray, values: np.ndarray, settings: SearchSettings) -> Plans:
+def refit(
+    source: Plans,
+    plans: np.ndarray,
+    values: np.ndarray,
+    settings: SearchSettings,
+    beginning: np.ndarray,
+    directions: np.ndarray | None,
+) -> Plans:
     """Fit the Gaussians to the best plans so far.
 
     :param source: what the last round was drawn from; stays where no plan was valid.
     :param plans: ``[n_envs, candidates, rollout_depth, act_dim]``, of all rounds until now.
     :param values: ``[n_envs, candidates, sim]``, theirs.
     :param settings: the number of elites, and the floor of the spread.
+    :param beginning: ``[rollout_depth, 1]``, standard deviations of the first round; caps the floor.
+    :param directions: ``[proposal_dims, act_dim]``; ``None``: all.
     :return: mean and standard deviation of the elites.
     """
     means, _ = mean_values(values)
@@ -130,8 +148,11 @@ def refit(source: Plans, plans: np.ndarray, values: np.ndarray, settings: Search
     weights = (valid / np.maximum(count, 1)[:, None]).astype(np.float32)[..., None, None]
     chosen = np.take_along_axis(plans, elites[..., None, None], axis=1)
     mean = (weights * chosen).sum(axis=1)
-    spread = np.sqrt((weights * np.square(chosen - mean[:, None])).sum(axis=1))
-    floor = np.minimum(first_spread(settings), np.float32(settings.min_noise))
+    deviations = chosen - mean[:, None]
+    if directions is not None:
+        deviations = deviations @ directions.T
+    spread = np.sqrt((weights * np.square(deviations)).sum(axis=1))
+    floor = np.minimum(beginning, np.float32(settings.min_noise * gain(directions)))
     none = (count == 0)[:, None, None]
     return Plans(np.where(none, source.mean, mean), np.where(none, source.spread, np.maximum(spread, floor)))
 

@@ -2,6 +2,7 @@
 
 import math
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +19,7 @@ MAX_NOISE = 1e6
 MAX_THREADS = 1024
 MATMUL_PRECISIONS = ("highest", "high", "medium")
 STRATEGIES = ("beam", "tree", "refine")
+TQC_VALUES = ("mean", "truncated")
 
 
 @dataclass(frozen=True)
@@ -25,8 +27,8 @@ class SearchSettings(CheckedSettings):
     """Settings of a search: Monte Carlo Beam Search (Algorithm 1) unless ``strategy`` says otherwise.
 
     :param beam_width: number of candidate actions per decision (``B``).
-    :param rollout_depth: simulated steps per rollout (``D``). 0 ranks the candidates by the critics
-        alone: nothing is simulated and no snapshot is needed.
+    :param rollout_depth: simulated steps per rollout (``D``), macro-steps if ``noise_hold`` is above 1. 0
+        ranks the candidates by the critics alone: nothing is simulated and no snapshot is needed.
     :param n_simulations: rollouts per candidate (``N_sim``).
     :param beam_noise: standard deviation of the Gaussian noise that makes candidates of the policy's
         action (``sigma_b``), in the action space scaled to [-1, 1].
@@ -62,6 +64,14 @@ class SearchSettings(CheckedSettings):
     :param n_elites: the best plans that a round of a refinement goes on from. ``None``: a quarter of
         ``beam_width``.
     :param min_noise: what the spread of a refinement does not fall below, in the scaled action space.
+    :param entropy_bonus: of SAC and TQC, whether values are soft: every action after the first, the last one
+        included, adds ``-ent_coef * log pi(a|s)``, as in the critics' target. With the strategy ``"beam"``.
+    :param tqc_value: of TQC, ``"mean"`` of all quantiles of all critics, or ``"truncated"``: without the
+        ``top_quantiles_to_drop_per_net`` highest per critic of them all, as in the critics' target.
+    :param noise_hold: environment steps in a macro-step, in which all noise stays the same while the policy
+        goes on reacting. A rollout simulates ``rollout_depth * noise_hold`` environment steps.
+    :param proposal_dims: candidates (of a tree: all children, of a refinement: whole plans) differ only in so
+        many directions, those in which recently executed actions varied most. ``None``: in all.
     :raises TypeError: if a value has the wrong type.
     :raises ValueError: if a value is out of range.
     """
@@ -87,6 +97,10 @@ class SearchSettings(CheckedSettings):
     n_rounds: int = 3
     n_elites: int | None = None
     min_noise: float = 0.02
+    entropy_bonus: bool = False
+    tqc_value: str = "mean"
+    noise_hold: int = 1
+    proposal_dims: int | None = None
 
     def __post_init__(self) -> None:
         self._set_integer("beam_width", 1, MAX_ROLLOUTS)
@@ -95,6 +109,9 @@ class SearchSettings(CheckedSettings):
         self._set_integer("n_threads", 0, MAX_THREADS)
         self._set_integer("branching", 1, MAX_ROLLOUTS)
         self._set_integer("n_rounds", 1, MAX_ROLLOUTS)
+        self._set_integer("noise_hold", 1, MAX_DEPTH)
+        if self.proposal_dims is not None:
+            self._set_integer("proposal_dims", 1, MAX_ROLLOUTS)
         for name in ("beam_noise", "min_noise"):
             self._set_number(name, MAX_NOISE)
         for name in ("rollout_noise", "noise_clip"):
@@ -102,16 +119,20 @@ class SearchSettings(CheckedSettings):
                 self._set_number(name, MAX_NOISE)
         if self.n_elites is not None:
             self._set_integer("n_elites", 1, self.beam_width)
-        for name in ("include_policy_action", "common_noise", "antithetic", "one_node_per_root"):
+        flags = ("include_policy_action", "common_noise", "antithetic", "one_node_per_root", "entropy_bonus")
+        for name in flags:
             self._check_flag(name)
         self._check_name("forward_model", KINDS)
         self._check_name("strategy", STRATEGIES)
+        self._check_name("tqc_value", TQC_VALUES)
         if self.matmul_precision is not None:
             self._check_name("matmul_precision", MATMUL_PRECISIONS, "None")
 
         self._check_strategy()
         self._check_proposals()
         self._check_common_noise()
+        self._check_entropy_bonus()
+        self._check_hierarchy()
         self._check_budget()
         self._check_size()
 
@@ -129,10 +150,11 @@ class SearchSettings(CheckedSettings):
                 f"{' * '.join(factors)} is {rollouts} rollouts per environment; at most "
                 f"{MAX_ROLLOUTS} are supported."
             )
-        if rollouts * self.rollout_depth > MAX_STEPS:
+        if rollouts * self.horizon > MAX_STEPS:
+            factors += ["rollout_depth"] if self.noise_hold == 1 else ["rollout_depth", "noise_hold"]
             raise ValueError(
-                f"{' * '.join(factors)} * rollout_depth is {rollouts * self.rollout_depth} steps per "
-                f"environment; at most {MAX_STEPS} are supported."
+                f"{' * '.join(factors)} is {rollouts * self.horizon} steps per environment; at most "
+                f"{MAX_STEPS} are supported."
             )
 
     def _check_budget(self) -> None:
@@ -209,6 +231,36 @@ class SearchSettings(CheckedSettings):
                 "rollout_noise and noise_clip: leave it out."
             )
 
+    def _check_entropy_bonus(self) -> None:
+        if not self.entropy_bonus:
+            return
+        if self.rollout_depth == 0:
+            raise ValueError(
+                "entropy_bonus needs a rollout_depth of 1 or more: it is for the actions after the first."
+            )
+        if self.strategy != "beam":
+            raise ValueError(
+                f"entropy_bonus works with strategy='beam' only, got strategy={self.strategy!r}: where later "
+                "actions are chosen by their value, it would favour those that the policy never takes."
+            )
+
+    def _check_hierarchy(self) -> None:
+        if self.noise_hold > 1:
+            if self.rollout_depth == 0:
+                raise ValueError(
+                    "noise_hold needs a rollout_depth of 1 or more: with 0 nothing is simulated."
+                )
+            if not self._is_noisy(max(self.beam_noise, self.effective_rollout_noise)):
+                raise ValueError(
+                    "noise_hold holds noise; there is none with this beam_noise, rollout_noise and "
+                    "noise_clip: leave it out."
+                )
+        if self.proposal_dims is not None and not self._is_noisy(self.beam_noise):
+            raise ValueError(
+                "proposal_dims needs a beam_noise above 0, and a noise_clip above 0 if it is set: without "
+                "noise there are no directions."
+            )
+
     def _is_noisy(self, spread: float) -> bool:
         return spread > 0 and self.noise_clip != 0
 
@@ -216,6 +268,11 @@ class SearchSettings(CheckedSettings):
     def effective_rollout_noise(self) -> float:
         """Standard deviation of the noise on the later actions of a rollout."""
         return self.beam_noise if self.rollout_noise is None else self.rollout_noise
+
+    @property
+    def horizon(self) -> int:
+        """Environment steps that a rollout simulates."""
+        return self.rollout_depth * self.noise_hold
 
     @property
     def effective_n_elites(self) -> int:
@@ -238,14 +295,13 @@ class SearchSettings(CheckedSettings):
         :param deterministic: whether the environment's steps are.
         :return: steps; fewer are simulated where rollouts terminate.
         """
-        depth, simulations = self.rollout_depth, self.distinct_simulations(deterministic)
-        width = self.max_beam_width or self.beam_width
+        simulations, width = self.distinct_simulations(deterministic), self.max_beam_width or self.beam_width
         if self.strategy == "tree":
-            return width * self.branching * simulations * depth
+            return width * self.branching * simulations * self.horizon
         if self.strategy == "refine":
-            return self.n_rounds * width * simulations * depth
-        first = min(depth, 1) if deterministic else min(depth, 1) * simulations
-        return width * (first + max(depth - 1, 0) * simulations)
+            return self.n_rounds * width * simulations * self.horizon
+        shared = min(self.noise_hold, self.horizon) if deterministic else 0
+        return width * (shared + (self.horizon - shared) * simulations)
 
     @classmethod
     def preset(cls, name: str, **changes: Any) -> "SearchSettings":
@@ -256,9 +312,8 @@ class SearchSettings(CheckedSettings):
         :return: the settings.
         :raises ValueError: if there is no preset of that name.
         """
-        if not isinstance(name, str) or name not in PRESETS:
-            raise ValueError(f"There is no preset {name!r}; known are {', '.join(PRESETS)}.")
-        return cls(**{**PRESETS[name], **changes})
+        _check_preset(name)
+        return cls(**with_preset(name, changes))
 
 
 #: The settings that presets change, by the names of the presets. Around trained agents in deterministic
@@ -277,3 +332,22 @@ PRESETS: dict[str, dict[str, Any]] = {
         antithetic=True,
     ),
 }
+
+
+def with_preset(name: str | None, changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Start from a preset.
+
+    :param name: one of :data:`PRESETS`; ``None``: there is none.
+    :param changes: settings that stay as they are, whatever the preset says.
+    :return: the preset's settings and those.
+    :raises ValueError: if there is no preset of that name.
+    """
+    if name is None:
+        return dict(changes)
+    _check_preset(name)
+    return {**PRESETS[name], **changes}
+
+
+def _check_preset(name: object) -> None:
+    if not isinstance(name, str) or name not in PRESETS:
+        raise ValueError(f"There is no preset {name!r}; known are {', '.join(PRESETS)}.")

@@ -32,6 +32,7 @@ class Decision(NamedTuple):
     :param envs: the environments that decide, by their numbers in the memory.
     :param moments: the present moment of each, for the memory.
     :param record: whether the result shall hold the rollouts; of the strategy ``"beam"``.
+    :param directions: ``[proposal_dims, act_dim]``, in which candidates differ; ``None``: in all.
     """
 
     model: ForwardModel | None
@@ -45,6 +46,7 @@ class Decision(NamedTuple):
     envs: Sequence[int] = ()
     moments: Sequence[Moment] = ()
     record: bool = False
+    directions: np.ndarray | None = None
 
 
 def search(decision: Decision) -> SearchResult:
@@ -86,13 +88,13 @@ def check_dynamics(settings: SearchSettings, deterministic: bool) -> None:
 
 
 def _beam(decision: Decision) -> SearchResult:
-    noise = draw_noise(decision.rng, decision.settings, *decision.shape)
+    noise = draw_noise(decision.rng, decision.settings, *decision.shape, directions=decision.directions)
     return beam_search(*decision[:5], noise, decision.rng, decision.record)
 
 
 def _tree(decision: Decision) -> SearchResult:
     assert decision.model is not None, "a tree needs a forward model"
-    noise = draw_tree_noise(decision.rng, decision.settings, *decision.shape)
+    noise = draw_tree_noise(decision.rng, decision.settings, *decision.shape, decision.directions)
     return tree_search(decision.model, *decision[1:5], noise, decision.rng)
 
 
@@ -100,9 +102,14 @@ def _refine(decision: Decision) -> SearchResult:
     assert decision.model is not None, "a refinement needs a forward model"
     assert decision.memory is not None, "a refinement remembers its plans"
     noise = draw_plan_noise(decision.rng, decision.settings, *decision.shape)
-    remembered = decision.memory.recall(decision.envs, decision.moments)
-    result, plans = refine_search(decision.model, *decision[1:5], noise, decision.rng, remembered)
-    decision.memory.keep(plans, decision.envs, decision.moments)
+    hold = decision.settings.noise_hold
+    # The present macro-steps need not begin where those of the last decision did.
+    by_step = decision.memory.recall(decision.envs, decision.moments)
+    remembered = by_step.reshape(len(by_step), -1, hold, by_step.shape[2]).mean(axis=2)
+    result, plans = refine_search(
+        decision.model, *decision[1:5], noise, decision.rng, remembered, decision.directions
+    )
+    decision.memory.keep(np.repeat(plans, hold, axis=1), decision.envs, decision.moments)
     return result
 
 

@@ -1,7 +1,8 @@
 """Partial tree expansion: at every depth the best nodes are kept, and only those grow children.
 
 Axes: ``slots`` places for nodes per environment, some of them empty; ``sim`` simulations of each node. The
-forward model holds one row for each simulation that goes on, ordered by environment, simulation and slot.
+forward model holds one row for each simulation that goes on, ordered by environment, simulation and slot. A
+depth is a macro-step of ``noise_hold`` environment steps.
 """
 
 from collections.abc import Sequence
@@ -11,14 +12,17 @@ import numpy as np
 
 from sb3_mcbs.models.base import ForwardModel, Observations
 from sb3_mcbs.search.beam import choose
+from sb3_mcbs.search.directions import low_dimensional
 from sb3_mcbs.search.interface import Agent, FirstStep, SearchResult, take_rows
 from sb3_mcbs.search.proposals import (
     best,
+    clip_actions,
     critic_values,
     draw_normal,
     preselect,
     propose,
     scale,
+    without_first,
 )
 from sb3_mcbs.search.settings import SearchSettings
 
@@ -64,19 +68,25 @@ class _Growth(NamedTuple):
     """What one depth brought.
 
     :param nodes: all children.
-    :param view: of the rows after the step.
-    :param rewards: ``[rows]``, of the environment.
-    :param invalid: rows that diverged or whose value is not finite.
+    :param view: of the forward model's rows after the last step.
+    :param first_step: of every child that was stepped.
+    :param steps: simulated.
+    :param invalid: simulations that diverged or whose value is not finite.
     """
 
     nodes: _Nodes
     view: _View
-    rewards: np.ndarray
+    first_step: FirstStep
+    steps: int
     invalid: int
 
 
 def draw_tree_noise(
-    rng: np.random.Generator, settings: SearchSettings, n_envs: int, act_dim: int
+    rng: np.random.Generator,
+    settings: SearchSettings,
+    n_envs: int,
+    act_dim: int,
+    directions: np.ndarray | None = None,
 ) -> TreeNoise:
     """Draw the noise of one decision: first that of the root actions, then depth by depth.
 
@@ -84,6 +94,7 @@ def draw_tree_noise(
     :param settings: width, branching, depth and noise.
     :param n_envs: number of environments.
     :param act_dim: entries of one action.
+    :param directions: ``[proposal_dims, act_dim]``, in which children differ; ``None``: in all.
     :return: the noise, clipped to ``noise_clip`` if that is set.
     """
     width, pairs = settings.beam_width, settings.antithetic
@@ -91,9 +102,11 @@ def draw_tree_noise(
     roots = draw_normal(rng, (n_envs, 1, n_proposals, act_dim), 2 if pairs else None)
     nodes = 1 if settings.common_noise else width
     shape = (settings.rollout_depth - 1, n_envs, nodes, n_proposals // width, act_dim)
-    later = scale(draw_normal(rng, shape, 3 if pairs else None), settings.effective_rollout_noise, settings)
+    later = low_dimensional(draw_normal(rng, shape, 3 if pairs else None), directions)
+    later = scale(later, settings.effective_rollout_noise, settings)
     everywhere = np.broadcast_to(later, (*shape[:2], width, *shape[3:]))
-    return TreeNoise(scale(roots, settings.beam_noise, settings), everywhere)
+    roots = scale(low_dimensional(roots, directions), settings.beam_noise, settings)
+    return TreeNoise(roots, everywhere)
 
 
 def tree_search(
@@ -126,7 +139,7 @@ def tree_search(
     for depth in range(settings.rollout_depth):
         children = n_roots if depth == 0 else settings.branching
         drawn = noise.roots if depth == 0 else noise.later[depth - 1]
-        actions = _child_actions(nodes, view, drawn, children, agent, settings)
+        actions, offsets = _children(nodes, view, drawn, children, agent, settings)
         if not len(actions):
             break
         parents = np.repeat(nodes.rows, children, axis=2)
@@ -135,13 +148,13 @@ def tree_search(
             model.set_roots(roots, parents, rng)
         else:
             model.select(parents)
-        growth = _grow(model, nodes, actions, children, depth, agent)
+        growth = _grow(model, nodes, actions, offsets, children, depth * settings.noise_hold, agent, settings)
         if depth == 0:
             candidates = actions.reshape(n_envs, n_sim, n_roots, -1)[:, 0]
             first_step = _first_simulation(growth, n_envs, n_sim)
             growth = growth._replace(nodes=_numbered(growth.nodes))
         view = growth.view
-        simulated_steps += len(actions)
+        simulated_steps += growth.steps
         invalid += growth.invalid
         ranking = _join(growth.nodes, _finished(nodes))
         scores = _best_per_root(ranking, n_roots)
@@ -170,18 +183,20 @@ def _numbered(nodes: _Nodes) -> _Nodes:
     return nodes._replace(roots=np.broadcast_to(np.arange(nodes.roots.shape[1]), nodes.roots.shape))
 
 
-def _child_actions(
+def _children(
     nodes: _Nodes, view: _View, drawn: np.ndarray, children: int, agent: Agent, settings: SearchSettings
-) -> np.ndarray:
+) -> tuple[np.ndarray, np.ndarray]:
     """Propose actions in every simulation that goes on.
 
     :param drawn: ``[n_envs, slots, proposals, act_dim]``, the nodes' noise.
     :param children: how many actions are kept per node.
-    :return: ``[simulations that go on * children, act_dim]``.
+    :return: their actions and the noise in them, ``[simulations that go on * children, act_dim]``.
     """
     goes_on = nodes.rows >= 0
     rows = nodes.rows[goes_on]
     noise = np.broadcast_to(drawn[:, None], (*goes_on.shape, *drawn.shape[2:]))[goes_on]
+    if settings.include_policy_action:
+        noise = without_first(noise)
     actions = propose(view.policy_actions[rows], noise, settings.include_policy_action)
     if settings.n_proposals is not None:
         values = np.zeros((*goes_on.shape, drawn.shape[2]))
@@ -191,42 +206,69 @@ def _child_actions(
         kept = preselect(of_nodes, children, int(settings.include_policy_action))
         kept = kept.reshape(len(drawn), 1, -1, children)
         kept = np.broadcast_to(kept, (*goes_on.shape, children))[goes_on]
-        actions = np.take_along_axis(actions, kept[..., None], axis=1)
-    return actions.reshape(-1, actions.shape[2])
+        actions, noise = (np.take_along_axis(array, kept[..., None], axis=1) for array in (actions, noise))
+    return actions.reshape(-1, actions.shape[2]), noise.reshape(-1, actions.shape[2])
 
 
 def _grow(
-    model: ForwardModel, nodes: _Nodes, actions: np.ndarray, children: int, depth: int, agent: Agent
+    model: ForwardModel,
+    nodes: _Nodes,
+    actions: np.ndarray,
+    offsets: np.ndarray,
+    children: int,
+    steps_before: int,
+    agent: Agent,
+    settings: SearchSettings,
 ) -> _Growth:
-    """Step the children, whose rows the forward model holds, and value them.
+    """Step the children, whose rows the forward model holds, for a macro-step, and value them.
 
-    :param actions: ``[rows, act_dim]``, scaled.
+    :param actions: ``[rows, act_dim]``, scaled, the first ones.
+    :param offsets: ``[rows, act_dim]``, what is added to the policy's actions in the steps after the first.
+    :param steps_before: environment steps from the root to the nodes.
     """
-    step = model.step(agent.unscale_action(actions))
-    rewards = np.where(step.valid, agent.scale_reward(step.rewards), np.nan)
     stepped = np.repeat(nodes.rows >= 0, children, axis=2)
     returns = np.repeat(nodes.returns, children, axis=2)
-    returns[stepped] += agent.gamma**depth * rewards
-
-    goes_on = step.valid & ~step.terminated
-    policy_actions = np.zeros_like(actions)
-    row_totals = returns[stepped]
-    if goes_on.any():
-        observations = take_rows(step.observations, goes_on)
-        policy_actions[goes_on] = agent.policy(observations)
-        values = agent.value(observations, policy_actions[goes_on]).astype(np.float64)
-        row_totals[goes_on] += agent.gamma ** (depth + 1) * values
-    totals = returns.copy()
-    totals[stepped] = row_totals
-    scores = totals.mean(axis=1)
+    totals, running, steps = returns[stepped], np.arange(len(actions)), 0
+    for number in range(settings.noise_hold):
+        step = model.step(agent.unscale_action(actions))
+        steps += len(actions)
+        if number == 0:
+            first_step = FirstStep(take_rows(step.observations, slice(None)), step.rewards.copy())
+        rewards = np.where(step.valid, agent.scale_reward(step.rewards), np.nan)
+        totals[running] += agent.gamma ** (steps_before + number) * rewards
+        goes_on = step.valid & ~step.terminated
+        view = _look(step.observations, goes_on, agent, actions.shape[1])
+        stepping, running = running, running[goes_on]
+        if not len(running):
+            break
+        if number + 1 < settings.noise_hold:
+            actions = clip_actions(view.policy_actions[goes_on] + offsets[running])
+            if not goes_on.all():
+                model.select(np.flatnonzero(goes_on))
+    returns[stepped] = totals
+    if len(running):
+        values = agent.value(take_rows(view.observations, goes_on), view.policy_actions[goes_on])
+        totals[running] += agent.gamma ** (steps_before + settings.noise_hold) * values.astype(np.float64)
+    with_values = returns.copy()
+    with_values[stepped] = totals
+    scores = with_values.mean(axis=1)
     # A node that did not grow has no children.
     scores[~(np.isfinite(scores) & stepped.any(axis=1))] = -np.inf
 
+    row_of = np.full(len(totals), -1)
+    row_of[stepping] = np.where(goes_on, np.arange(len(goes_on)), -1)
     rows = np.full(stepped.shape, -1)
-    rows[stepped] = np.where(goes_on, np.arange(len(goes_on)), -1)
+    rows[stepped] = row_of
     grown = _Nodes(scores, np.repeat(nodes.roots, children, axis=1), returns, rows)
-    view = _View(take_rows(step.observations, slice(None)), policy_actions)
-    return _Growth(grown, view, step.rewards.copy(), int(np.count_nonzero(~np.isfinite(row_totals))))
+    return _Growth(grown, view, first_step, steps, int(np.count_nonzero(~np.isfinite(totals))))
+
+
+def _look(observations: Observations, goes_on: np.ndarray, agent: Agent, act_dim: int) -> _View:
+    """Observe rows of the forward model, and ask the policy where the simulation goes on."""
+    policy_actions = np.zeros((len(goes_on), act_dim), dtype=np.float32)
+    if goes_on.any():
+        policy_actions[goes_on] = agent.policy(take_rows(observations, goes_on))
+    return _View(take_rows(observations, slice(None)), policy_actions)
 
 
 def _finished(nodes: _Nodes) -> _Nodes:
@@ -282,5 +324,6 @@ def _best_per_root(nodes: _Nodes, n_roots: int) -> np.ndarray:
 
 def _first_simulation(growth: _Growth, n_envs: int, n_sim: int) -> FirstStep:
     """The first step of every root action in its first simulation, ``[n_envs * n_roots]``."""
-    rows = np.arange(len(growth.rewards)).reshape(n_envs, n_sim, -1)[:, 0].ravel()
-    return FirstStep(take_rows(growth.view.observations, rows), growth.rewards[rows])
+    observations, rewards = growth.first_step
+    rows = np.arange(len(rewards)).reshape(n_envs, n_sim, -1)[:, 0].ravel()
+    return FirstStep(take_rows(observations, rows), rewards[rows])

@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_mcbs.checkpoints import CheckpointError, ExactCheckpointCallback
 from sb3_mcbs.checkpoints.resume import continue_with
 from sb3_mcbs.checkpoints.resumption import Resumption
-from sb3_mcbs.search import SearchSettings
+from sb3_mcbs.search import SearchSettings, with_preset
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 from sb3_mcbs.zoo.callbacks import SearchEvalCallback, SecondEvalCallback
 from sb3_mcbs.zoo.paths import hyperparams_path, sibling_folder
@@ -88,6 +88,10 @@ class MCBSExperimentManager(ExperimentManager):
         """
         Read the hyperparameters as RL Zoo does, and accept 0 as a trial's number.
 
+        A preset of the command line goes before what the file says of the search.
+
+        :raises ValueError: if trials that draw the search's settings are given a preset
+
         :return: the hyperparameters, and the same in order, to be saved
         """
         first_trial = self.trial_id == 0 and self.storage and self.study_name
@@ -95,6 +99,13 @@ class MCBSExperimentManager(ExperimentManager):
             print("Loading from Optuna study...")
             trial = self.load_trial(str(self.storage), str(self.study_name), 0)
             self.custom_hyperparams = {**trial, **(self.custom_hyperparams or {})}
+        custom = self.custom_hyperparams or {}
+        if self.algo in ALGORITHMS and custom.get("preset") is not None:
+            if self.optimize_hyperparameters:
+                raise ValueError(
+                    "Trials draw the search's settings and know no preset: leave preset out of -params."
+                )
+            self.custom_hyperparams = with_preset(custom["preset"], custom)
         return super().read_hyperparameters()
 
     def _preprocess_hyperparams(
@@ -159,6 +170,8 @@ def _checked_search_evaluation(settings: Any, algo: str) -> dict[str, Any]:
             "search_evaluation must be a dictionary of search settings such as "
             f"{{beam_width: 6, rollout_depth: 3}}, got {settings!r}."
         )
+    settings = dict(settings)
+    settings = with_preset(settings.pop("preset", None), settings)
     unknown = sorted(set(settings) - set(SearchSettings.names()))
     if unknown:
         raise ValueError(
@@ -166,7 +179,7 @@ def _checked_search_evaluation(settings: Any, algo: str) -> dict[str, Any]:
             f"Known are: {', '.join(SearchSettings.names())}."
         )
     SearchSettings(**settings)
-    return dict(settings)
+    return settings
 
 
 def _wrapped_for_search(wrapper: Callable[[gym.Env], gym.Env] | None) -> Callable[[gym.Env], gym.Env]:

@@ -4,7 +4,8 @@ What ``-optimize`` draws for our algorithms, and how a trial's parameters become
 By default only the size and noise of the search are tuned and the other settings of the hyperparameter file
 are held, so that trials differ in one thing. ``SB3_MCBS_TUNE=strategies`` tunes how it searches as well,
 ``SB3_MCBS_TUNE=schedules`` when it searches and what is learned from it, ``SB3_MCBS_TUNE=all`` what RL Zoo
-tunes of the algorithm without search.
+tunes of the algorithm without search. Trials know no ``preset``: one in
+the hyperparameter file would change what a trial does not draw.
 """
 
 import os
@@ -17,6 +18,7 @@ from sb3_mcbs.algorithms.rollout_replay import RolloutReplaySettings
 from sb3_mcbs.search import ScheduleSettings, SearchSettings
 from sb3_mcbs.search.checks import CheckedSettings
 from sb3_mcbs.search.schedule import SCHEDULES, UNITS
+from sb3_mcbs.search.settings import TQC_VALUES
 
 SWITCH = "SB3_MCBS_TUNE"
 SCOPES = ("search", "strategies", "schedules", "all")
@@ -29,6 +31,8 @@ STRATEGIES = ("beam", "tree", "refine")
 PROPOSAL_FACTORS = (1, 4, 8)
 BRANCHING = (2, 3, 5)
 N_ROUNDS = (2, 3, 4)
+NOISE_HOLD = (1, 2, 3)
+PROPOSAL_DIMS = (None, 1, 2, 3)
 SEARCH_SHARES = (0.25, 0.5, 1.0)
 #: As parts of ``search_share``.
 FINAL_SEARCH_SHARES = (0.0, 0.2, 0.5)
@@ -39,6 +43,8 @@ MAX_SIMULATED_STEPS = 600
 
 #: What trials store of a strategy under names that are no settings themselves.
 _HELPERS = ("proposal_factor", "noise_free_rollouts", "final_share_factor")
+
+_NO_PRESET: dict[str, Any] = {"preset": None}
 
 
 def tuning_scope() -> str:
@@ -74,11 +80,11 @@ def sample_mcbs_params(
         "beam_noise": trial.suggest_float("beam_noise", *BEAM_NOISE, log=True),
     }
     if scope == "strategies":
-        sampled |= _sample_strategy(trial)
+        sampled |= _sample_strategy(trial, base, sampled["rollout_depth"])
     if scope == "schedules":
         sampled |= _sample_schedule(trial)
     params = _search_settings(sampled)
-    reason = _why_senseless(params, sampled)
+    reason = _why_senseless(params, sampled, n_actions)
     if reason is not None:
         trial.set_user_attr("pruned", reason)
         raise optuna.TrialPruned(f"{reason}: {params}")
@@ -86,25 +92,31 @@ def sample_mcbs_params(
         from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
 
         params.update(HYPERPARAMS_SAMPLER[base](trial, n_actions, n_envs, additional_args))
-    return params
+    return {**params, **_NO_PRESET}
 
 
-def _sample_strategy(trial: optuna.Trial) -> dict[str, Any]:
+def _sample_strategy(trial: optuna.Trial, base: str, rollout_depth: int) -> dict[str, Any]:
     """Draw how to search, by the names that the trial stores."""
     strategy = trial.suggest_categorical("strategy", STRATEGIES)
     sampled: dict[str, Any] = {
         "strategy": strategy,
         "antithetic": trial.suggest_categorical("antithetic", (False, True)),
         "proposal_factor": trial.suggest_categorical("proposal_factor", PROPOSAL_FACTORS),
+        "noise_hold": trial.suggest_categorical("noise_hold", NOISE_HOLD),
+        "proposal_dims": trial.suggest_categorical("proposal_dims", PROPOSAL_DIMS),
     }
     if strategy == "beam":
         for name in ("noise_free_rollouts", "include_policy_action", "common_noise"):
             sampled[name] = trial.suggest_categorical(name, (False, True))
+        if base in ("sac", "tqc") and rollout_depth:
+            sampled["entropy_bonus"] = trial.suggest_categorical("entropy_bonus", (False, True))
     elif strategy == "tree":
         sampled["branching"] = trial.suggest_categorical("branching", BRANCHING)
         sampled["one_node_per_root"] = trial.suggest_categorical("one_node_per_root", (False, True))
     else:
         sampled["n_rounds"] = trial.suggest_categorical("n_rounds", N_ROUNDS)
+    if base == "tqc":
+        sampled["tqc_value"] = trial.suggest_categorical("tqc_value", TQC_VALUES)
     return sampled
 
 
@@ -136,11 +148,13 @@ def _search_settings(sampled: dict[str, Any]) -> dict[str, Any]:
     return settings
 
 
-def _why_senseless(params: dict[str, Any], sampled: dict[str, Any]) -> str | None:
+def _why_senseless(params: dict[str, Any], sampled: dict[str, Any], n_actions: int) -> str | None:
     if params["rollout_depth"] == 0 and params["n_simulations"] > 1:
         return "nothing is simulated at rollout_depth 0, so n_simulations above 1 repeats another trial"
     if sampled["n_simulations"] > 1 and (params["n_simulations"] == 1 or params.get("rollout_noise") == 0):
         return "n_simulations above 1 needs a beam with noise in its rollouts, else it repeats another trial"
+    if (params.get("proposal_dims") or 0) >= n_actions:
+        return f"proposal_dims of {n_actions} or more repeats another trial: actions have no more directions"
     try:
         settings = SearchSettings(**_of(params, SearchSettings))
         ScheduleSettings(**_of(params, ScheduleSettings)).check_search(settings)
@@ -165,6 +179,7 @@ def convert_mcbs_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     """
     search_names = {*_HELPERS, *(name for settings in SETTINGS for name in settings.names())}
     search = _search_settings({name: v for name, v in sampled_params.items() if name in search_names})
+    search |= _NO_PRESET
     others = {name: value for name, value in sampled_params.items() if name not in search_names}
     if not others:
         return search

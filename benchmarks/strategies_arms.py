@@ -1,0 +1,88 @@
+"""The searches that ``benchmarks.strategies`` compares: every strategy at about the same simulated steps."""
+
+from typing import Any
+
+from sb3_contrib import TQC
+from stable_baselines3 import SAC
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+#: Simulated steps per decision that arms are compared at, and how far an arm may be from them.
+BUDGETS = (20, 60, 110, 580)
+SLACK = 0.15
+
+#: The actor, whose action the critics rate: nothing is simulated.
+ACTOR: dict[str, Any] = dict(rollout_depth=0, beam_width=1, n_simulations=1, beam_noise=0.0)
+PLAIN: dict[str, Any] = dict(n_simulations=1, rollout_noise=0.0, include_policy_action=True)
+
+
+def beam(width: int, depth: int, **changes: Any) -> dict[str, Any]:
+    """Candidates around the policy's own action, without noise afterwards."""
+    return {**PLAIN, "beam_width": width, "rollout_depth": depth, **changes}
+
+
+def tree(width: int, branching: int, depth: int, **changes: Any) -> dict[str, Any]:
+    """Partial expansion."""
+    sizes = dict(strategy="tree", beam_width=width, branching=branching, rollout_depth=depth, n_simulations=1)
+    return {**sizes, "include_policy_action": True, "rollout_noise": 0.05, **changes}
+
+
+def refine(width: int, rounds: int, depth: int, **changes: Any) -> dict[str, Any]:
+    """Rounds around the best plans so far."""
+    sizes = dict(strategy="refine", beam_width=width, n_rounds=rounds, rollout_depth=depth, n_simulations=1)
+    return {**sizes, "antithetic": True, **changes}
+
+
+ARMS: dict[str, dict[str, Any]] = {
+    "actor alone": ACTOR,
+    "paper": {},
+    # about 20 simulated steps
+    "beam 6x3": beam(6, 3),
+    "beam 3x6": beam(3, 6),
+    "beam 3x(2x3)": beam(3, 2, noise_hold=3),
+    "beam 6x3 in 2": beam(6, 3, proposal_dims=2),
+    "beam 6x3 of 48": beam(6, 3, n_proposals=48),
+    "tree 2x3x3": tree(2, 3, 3),
+    "refine 3x2x3": refine(3, 2, 3),
+    "refine 6x1x3": refine(6, 1, 3),
+    "refine 3x1x6": refine(3, 1, 6),
+    "refine 3x1x(3x2)": refine(3, 1, 3, noise_hold=2),
+    # about 60
+    "beam 10x6": beam(10, 6),
+    "beam 10x(3x2)": beam(10, 3, noise_hold=2),
+    "tree 5x2x6": tree(5, 2, 6),
+    "refine 7x3x3": refine(7, 3, 3),
+    "refine 5x2x6": refine(5, 2, 6),
+    "refine 10x1x6": refine(10, 1, 6),
+    "refine 5x2x(3x2)": refine(5, 2, 3, noise_hold=2),
+    "refine 5x2x6 in 3": refine(5, 2, 6, proposal_dims=3),
+    # about 110
+    "beam 18x6": beam(18, 6),
+    "tree 6x6x3": tree(6, 6, 3, one_node_per_root=True),
+    "tree 6x3x6": tree(6, 3, 6),
+    "refine 12x3x3": refine(12, 3, 3),
+    "refine 6x3x6": refine(6, 3, 6),
+    "refine 9x2x6": refine(9, 2, 6),
+    "refine 18x1x6": refine(18, 1, 6),
+    "refine 9x2x(3x2)": refine(9, 2, 3, noise_hold=2),
+    "refine 9x2x6 in 3": refine(9, 2, 6, proposal_dims=3),
+    # about 580
+    "beam 96x6": beam(96, 6),
+    "tree 16x6x6": tree(16, 6, 6),
+    "refine 24x4x6": refine(24, 4, 6, n_elites=4),
+    "refine 16x4x9": refine(16, 4, 9, n_elites=4),
+    "refine 12x4x12": refine(12, 4, 12, n_elites=4),
+    "refine 16x3x(6x2)": refine(16, 3, 6, n_elites=4, noise_hold=2),
+    # other values, for agents that have them
+    "paper, soft": dict(entropy_bonus=True),
+    "paper, truncated": dict(tqc_value="truncated"),
+    "beam 6x3, soft": beam(6, 3, entropy_bonus=True),
+    "beam 6x3, truncated": beam(6, 3, tqc_value="truncated"),
+    "refine 12x3x3, truncated": refine(12, 3, 3, tqc_value="truncated"),
+}
+
+
+def has_value(agent: OffPolicyAlgorithm, settings: dict[str, Any]) -> bool:
+    """Whether an agent's networks give the values that settings ask for."""
+    if settings.get("tqc_value", "mean") != "mean" and not isinstance(agent, TQC):
+        return False
+    return not settings.get("entropy_bonus") or isinstance(agent, SAC | TQC)
