@@ -7,6 +7,7 @@ from typing import Any, TypedDict
 
 from sb3_mcbs.algorithms.learned_model import EnsembleSettings
 from sb3_mcbs.algorithms.rollout_replay import RolloutReplaySettings
+from sb3_mcbs.algorithms.value_expansion import ValueExpansionSettings
 from sb3_mcbs.search import ScheduleSettings, SearchSettings, with_preset
 from sb3_mcbs.search.checks import CheckedSettings
 
@@ -15,6 +16,7 @@ SETTINGS: tuple[type[CheckedSettings], ...] = (
     SearchSettings,
     ScheduleSettings,
     RolloutReplaySettings,
+    ValueExpansionSettings,
     EnsembleSettings,
 )
 
@@ -59,6 +61,8 @@ class SearchKeywords(TypedDict, total=False):
     saturation_tolerance: float
     recovery_tolerance: float
     rollout_replay: float
+    value_expansion: int
+    expanded_share: float
     ensemble_size: int
     ensemble_train_freq: int
     ensemble_gradient_steps: int
@@ -104,6 +108,8 @@ class SearchAttributes:
     saturation_tolerance: float
     recovery_tolerance: float
     rollout_replay: float
+    value_expansion: int
+    expanded_share: float
     ensemble_size: int
     ensemble_train_freq: int
     ensemble_gradient_steps: int

@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from typing import Any, TypeVar
 
 import numpy as np
@@ -26,8 +25,8 @@ from sb3_mcbs.algorithms.faults import (
 from sb3_mcbs.algorithms.keywords import SearchAttributes, complete_settings, list_search_settings
 from sb3_mcbs.algorithms.learned_model import EnsembleSettings, LearnedModel, set_up_learned_model
 from sb3_mcbs.algorithms.learned_search import make_searcher
-from sb3_mcbs.algorithms.rollout_replay import RolloutReplay, RolloutReplaySettings, mixed_batches
 from sb3_mcbs.algorithms.searcher import Searcher
+from sb3_mcbs.algorithms.simulated_batches import SimulatedBatches
 from sb3_mcbs.algorithms.torch_settings import matmul_precision
 from sb3_mcbs.search import (
     RecentActions,
@@ -92,6 +91,7 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         self._decision: tuple[SearchResult, Sequence[int]] | None = None
         self._rollouts: Rollouts | None = None
         self.rollout_rng: np.random.Generator | None = None
+        self._simulated_batches: SimulatedBatches | None = None
         self.learned_model: LearnedModel | None = None
         self._checked_env: CheckedVecEnv | None = None
 
@@ -113,7 +113,6 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
             )
         settings, schedule = self.search_settings, self.schedule_settings
         schedule.check_search(settings)
-        RolloutReplaySettings.of(self).check_search(settings)
         if not isinstance(self.action_noise_after_search, bool):
             raise TypeError(
                 f"action_noise_after_search must be True or False, got {self.action_noise_after_search!r}."
@@ -126,22 +125,12 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         self._schedule.settings = schedule
         if self.recent_actions is None and settings.proposal_dims is not None:
             self.recent_actions = RecentActions(get_action_dim(self.action_space))
-        if self.rollout_replay:
-            assert self.replay_buffer is not None
-            RolloutReplay(self.replay_buffer, *schedule.most_rollouts(settings))  # makes room in it
         if self.rollout_rng is None:
             self.rollout_rng = np.random.default_rng(self.seed)
+        self._simulated_batches = SimulatedBatches(self)
         set_up_learned_model(self)
         if self.env is not None:
             self._make_searcher(self.env, settings)
-
-    def _rollout_store(self) -> RolloutReplay | None:
-        """The rollouts beside the replay buffer, if the agent learns from them."""
-        if not self.rollout_replay:
-            return None
-        assert self.replay_buffer is not None and self._schedule is not None and self._searcher is not None
-        size = self._schedule.settings.most_rollouts(self._searcher.settings)
-        return RolloutReplay(self.replay_buffer, *size)
 
     def _make_searcher(self, env: VecEnv, settings: SearchSettings) -> None:
         if self._searcher is not None:
@@ -150,6 +139,8 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         normalizer = unwrap_vec_normalize(env)
         normalize_reward = normalizer is not None and normalizer.norm_reward
         self._searcher = make_searcher(self, env, settings, normalize_reward, self.recent_actions)
+        if self._simulated_batches is not None:
+            self._simulated_batches.connect()
         if self.verbose >= 1:
             print(f"Forward model: {self._searcher.description}")
 
@@ -267,10 +258,8 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
             error = self._searcher.model_error(*self._decision, new_obs, raw_reward, infos)
             if error is not None:
                 self.logger.record_mean("search/model_error", error)
-        rollout_store = self._rollout_store()
-        if rollout_store is not None:
-            rollout_store.put(replay_buffer.pos, self._rollouts)
-            self.logger.record("search/stored_rollouts", rollout_store.count)
+        assert self._simulated_batches is not None
+        self._simulated_batches.store(replay_buffer.pos, self._rollouts, dones)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
     def collect_rollouts(self, env: VecEnv, *args: Any, **kwargs: Any) -> RolloutReturn:
@@ -305,15 +294,9 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         """
         if self.learned_model is not None:
             self.learned_model.fit_if_due(self, EnsembleSettings.of(self))
-        with matmul_precision(self.matmul_precision), self._learning_from_rollouts():
+        assert self._simulated_batches is not None
+        with matmul_precision(self.matmul_precision), self._simulated_batches.mixed():
             super().train(gradient_steps, batch_size)
-
-    def _learning_from_rollouts(self) -> AbstractContextManager[None]:
-        rollout_store = self._rollout_store()
-        if rollout_store is None or rollout_store.count == 0:
-            return nullcontext()
-        assert self.rollout_rng is not None
-        return mixed_batches(self, rollout_store, self.rollout_replay, self.rollout_rng)
 
     def _record_decision(self, result: SearchResult, seconds: float, effort: SearchSettings) -> None:
         n_envs = len(result.chosen)
@@ -404,5 +387,5 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         return super().predict(observation, state, episode_start, deterministic)
 
     def _excluded_save_params(self) -> list[str]:
-        transient = ["_searcher", "_decision", "_rollouts", "_checked_env"]
+        transient = ["_searcher", "_decision", "_rollouts", "_checked_env", "_simulated_batches"]
         return [*super()._excluded_save_params(), *transient]

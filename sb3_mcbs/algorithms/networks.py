@@ -164,18 +164,20 @@ def _to_numpy(tensor: th.Tensor, device: th.device) -> np.ndarray:
     return (tensor if device.type == "cpu" else tensor.cpu()).numpy()
 
 
-def policy_function(agent: OffPolicyAlgorithm) -> Callable[[Observations], np.ndarray]:
+def policy_function(agent: OffPolicyAlgorithm, target: bool = False) -> Callable[[Observations], np.ndarray]:
     """The actor without exploration: its output (TD3, DDPG) or its squashed mean (SAC, TQC).
 
     :param agent: a supported agent; its present networks are used at every call.
+    :param target: the target actor's, where there is one.
     :return: observations ``[rows, *obs_shape]`` -> float32 actions ``[rows, act_dim]`` in [-1, 1].
     """
     policy_network: Any = agent.policy
     stochastic = isinstance(agent, SAC | TQC)
+    name = "actor_target" if target and not stochastic else "actor"
     mlp_of = _if_plain(actor_mlp)
 
     def policy(observations: Observations) -> np.ndarray:
-        actor = policy_network.actor
+        actor = getattr(policy_network, name)
         mlp = mlp_of(actor)
         if mlp is not None:
             assert isinstance(observations, np.ndarray)

@@ -6,17 +6,13 @@ policy, at states that were really visited, from rewards of the exact simulator.
 the transition of the same step, in arrays of their own: they are never taken for experience.
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from operator import itemgetter
 from typing import Any, cast
 
 import numpy as np
-import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -170,56 +166,9 @@ class RolloutReplay:
         return np.unravel_index(drawn[:n], shape)
 
 
-class _Mixture:
-    """A replay buffer whose batches are transitions and rollouts."""
-
-    def __init__(self, agent: OffPolicyAlgorithm, rollouts: RolloutReplay, share: float, rng: Any) -> None:
-        self._agent, self._rollouts, self._share, self._rng = agent, rollouts, share, rng
-
-    def sample(self, batch_size: int, env: VecNormalize | None = None) -> Any:
-        n_rollouts = round(self._share * batch_size)
-        parts = []
-        if n_rollouts < batch_size:
-            own = self._rollouts.buffer.sample(batch_size - n_rollouts, env=env)
-            if own.discounts is None:
-                own = own._replace(discounts=th.full_like(own.rewards, self._agent.gamma))
-            parts.append(own)
-        if n_rollouts:
-            parts.append(self._rollouts.sample(n_rollouts, self._agent.gamma, self._rng, env))
-        return parts[0] if len(parts) == 1 else type(parts[0])(*map(_joined, *parts))
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._rollouts.buffer, name)
-
-
-@contextmanager
-def mixed_batches(
-    agent: OffPolicyAlgorithm, rollouts: RolloutReplay, share: float, rng: np.random.Generator
-) -> Iterator[None]:
-    """Let an agent's gradient steps draw a part of every batch from the rollouts.
-
-    :param agent: the agent.
-    :param rollouts: beside its replay buffer.
-    :param share: of every batch.
-    :param rng: draws the rollouts.
-    """
-    buffer = agent.replay_buffer
-    agent.replay_buffer = _Mixture(agent, rollouts, share, rng)  # type: ignore[assignment]
-    try:
-        yield
-    finally:
-        agent.replay_buffer = buffer
-
-
 def _zeros(space: spaces.Space, shape: tuple[int, ...]) -> Observations:
     if isinstance(space, spaces.Dict):
         return {key: _zeros(part, shape) for key, part in space.items()}  # type: ignore[misc]
     # Networks see float32; there are many more rollouts than transitions.
     dtype = np.float32 if space.dtype == np.float64 else space.dtype
     return np.zeros((*shape, *(space.shape or ())), dtype)
-
-
-def _joined(first: Any, second: Any) -> Any:
-    if isinstance(first, dict):
-        return {key: th.cat([first[key], second[key]]) for key in first}
-    return th.cat([first, second])

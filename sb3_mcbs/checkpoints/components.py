@@ -27,6 +27,7 @@ NOT_STATE: dict[type, dict[str, str]] = {
         "_searcher": "its forward model simulates the environments as they are; what it noticed is saved",
         "_decision": "of the last step; made anew before it is read",
         "_rollouts": "of the last step; made anew before it is read",
+        "_simulated_batches": "a view of the replay buffer",
         "_update": "a view of networks, optimizers and replay buffer",
         "_checked_env": "a view of the environment",
         "_resumption": "only there until a run was resumed",

@@ -1,0 +1,186 @@
+"""Targets of the critics from a few exact steps of the present actor: model-based value expansion.
+
+After a stored transition the simulator goes on, from the state that it was really in, with the actions that
+the present target actor takes (Feinberg et al., 2018, with the simulator for a model). The critics bootstrap
+some steps later: rewards are exact, actions are not old ones as in the returns of ``n_steps``, and values
+travel several steps in one update.
+"""
+
+from dataclasses import dataclass
+from operator import itemgetter
+from typing import Any, cast
+
+import numpy as np
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_mcbs.algorithms.mixed_batches import Samples
+from sb3_mcbs.algorithms.networks import policy_function
+from sb3_mcbs.algorithms.searcher import Searcher
+from sb3_mcbs.models import ForwardModelError
+from sb3_mcbs.search import SearchSettings
+from sb3_mcbs.search.checks import CheckedSettings
+from sb3_mcbs.search.interface import map_arrays, put_rows, take_rows
+
+#: More steps than this after every sampled transition are a mistake.
+MAX_EXPANSION = 1000
+
+
+@dataclass(frozen=True)
+class ValueExpansionSettings(CheckedSettings):
+    """Whether the critics' targets look further than one step.
+
+    :param value_expansion: steps that are simulated after a sampled transition, with the present target
+        actor, before the critics' target closes it. 0: none, as SB3.
+    :param expanded_share: the share of every batch whose transitions are expanded. Every gradient step
+        simulates ``value_expansion`` environment steps for each of them.
+    :raises TypeError: if a value has the wrong type.
+    :raises ValueError: if a value is out of range.
+    """
+
+    value_expansion: int = 0
+    expanded_share: float = 0.5
+
+    def __post_init__(self) -> None:
+        self._set_integer("value_expansion", 0, MAX_EXPANSION)
+        self._set_number("expanded_share", 1.0)
+        if self.value_expansion and not self.expanded_share:
+            raise ValueError("value_expansion needs an expanded_share above 0: nothing would be expanded.")
+
+    def check_search(self, settings: SearchSettings, rollout_replay: float, buffer: ReplayBuffer) -> None:
+        """Refuse what does not go together.
+
+        :param settings: of the search.
+        :param rollout_replay: share of every batch that is taken from rollouts.
+        :param buffer: the replay buffer.
+        :raises ValueError: says which setting, and why.
+        """
+        if not self.value_expansion:
+            return
+        if settings.rollout_depth == 0:
+            raise ValueError(
+                "value_expansion needs a rollout_depth of 1 or more: with 0 there is no forward model. "
+                "search_share=0 leaves the search out."
+            )
+        if rollout_replay + self.expanded_share > 1:
+            raise ValueError(
+                "rollout_replay and expanded_share are parts of the same batch and must not exceed 1 "
+                f"together; got {rollout_replay} and {self.expanded_share}."
+            )
+        if buffer.optimize_memory_usage:
+            raise ValueError(
+                "value_expansion goes on from the last observation of a transition, which a replay buffer "
+                "with optimize_memory_usage does not keep at the end of an episode: leave that out."
+            )
+
+
+class ValueExpansion:
+    """The simulator's states beside the rows of a replay buffer, and what follows from them.
+
+    States are attributes of the buffer, so that they are saved and loaded with it: for every row and
+    environment the state after the step, and whether there is one (not where the episode ended).
+
+    :param agent: an :class:`~sb3_mcbs.MCBS` agent; what is simulated is added to its ``n_simulated_steps``.
+    :param searcher: of the agent, with its forward model.
+    :raises ForwardModelError: if the forward model's states are no arrays.
+    """
+
+    def __init__(self, agent: Any, searcher: Searcher) -> None:
+        self._agent, self._searcher = agent, searcher
+        self._target_policy = policy_function(agent, target=True)
+        buffer = self._buffer = cast(Any, agent.replay_buffer)
+        shape = (buffer.buffer_size, buffer.n_envs)
+        held = getattr(buffer, "expansion_states", None)
+        if held is None or held.shape[:2] != shape:
+            (state,) = self._states(range(1))
+            buffer.expansion_states = np.zeros((*shape, len(state)))
+            buffer.expansion_held = np.zeros(shape, dtype=bool)
+
+    def _states(self, envs: range) -> np.ndarray:
+        model = self._searcher.model
+        if model is None or model.kind != "mujoco":
+            raise ForwardModelError(
+                "value_expansion keeps the simulator's states in the replay buffer, which needs batched "
+                f"MuJoCo; here simulates: {self._searcher.description}. Leave value_expansion out."
+            )
+        return np.stack(model.read_roots(envs))
+
+    def put(self, row: int, dones: np.ndarray) -> None:
+        """Store the states that the environments are in after a step.
+
+        :param row: of the replay buffer that the step will be in.
+        :param dones: ``[n_envs]``, whether the episode ended: the environment is in another one then.
+        """
+        self._buffer.expansion_states[row] = self._states(range(self._buffer.n_envs))
+        self._buffer.expansion_held[row] = ~dones.astype(bool)
+
+    def sample(self, n: int, gamma: float, rng: np.random.Generator, env: VecNormalize | None) -> Samples:
+        """Draw transitions, and go on from them.
+
+        :param n: how many.
+        :param gamma: discount factor per step.
+        :param rng: draws them.
+        :param env: normalises observations and rewards.
+        :return: as of a buffer of transitions over several steps. Those that ended an episode are as they
+            were.
+        """
+        buffer = self._buffer
+        at = rng.integers(0, buffer.size(), n), rng.integers(0, buffer.n_envs, n)
+        rewards = np.array(buffer._normalize_reward(buffer.rewards[at], env), dtype=np.float64)
+        terminated = buffer.dones[at] * (1 - buffer.timeouts[at])
+        last = map_arrays(itemgetter(at), buffer.next_observations)
+        lengths = np.ones(n, dtype=int)
+        going = np.flatnonzero(buffer.expansion_held[at])
+        if len(going):
+            states = buffer.expansion_states[at[0][going], at[1][going]]
+            self._go_on(states, going, (rewards, terminated, last, lengths), gamma, rng, env)
+        samples = DictReplayBufferSamples if isinstance(last, dict) else ReplayBufferSamples
+        first = buffer._normalize_obs(map_arrays(itemgetter(at), buffer.observations), env)
+        last = buffer._normalize_obs(last, env)
+        return samples(
+            map_arrays(buffer.to_torch, first),
+            buffer.to_torch(buffer.actions[at]),
+            map_arrays(buffer.to_torch, last),
+            buffer.to_torch(terminated.astype(np.float32)[:, None]),
+            buffer.to_torch(rewards.astype(np.float32)[:, None]),
+            buffer.to_torch((gamma**lengths).astype(np.float32)[:, None]),
+        )
+
+    def _go_on(
+        self,
+        states: np.ndarray,
+        going: np.ndarray,
+        sums: tuple[np.ndarray, np.ndarray, Any, np.ndarray],
+        gamma: float,
+        rng: np.random.Generator,
+        env: VecNormalize | None,
+    ) -> None:
+        """Simulate the target actor from some states.
+
+        :param states: ``[m, state_size]``.
+        :param going: ``[m]``, whose states these are.
+        :param sums: returns ``[n]``, terminations ``[n]``, last observations ``[n, *]`` as buffers keep them
+            and lengths ``[n]`` of all transitions; changed.
+        """
+        returns, terminated, last, lengths = sums
+        searcher, model, buffer = self._searcher, self._searcher.model, self._buffer
+        assert model is not None
+        model.set_roots(list(states), np.arange(len(going)), rng)
+        seen = buffer._normalize_obs(take_rows(last, going), env)
+        for number in range(1, self._agent.value_expansion + 1):
+            step = model.step(searcher.unscale(self._target_policy(seen)))
+            self._agent.n_simulated_steps += len(going)
+            valid = np.flatnonzero(step.valid)  # a simulation that diverged ends one step earlier
+            at = going[valid]
+            returns[at] += gamma**number * buffer._normalize_reward(step.rewards[valid], env)
+            terminated[at] = step.terminated[valid]
+            lengths[at] += 1
+            put_rows(last, at, searcher.view.observe(step.observations, normalize=False), valid)
+            still = np.flatnonzero(step.valid & ~step.terminated)
+            if not len(still):
+                return
+            seen = take_rows(searcher.view.observe(step.observations), still)
+            if len(still) < len(going):
+                model.select(still)
+                going = going[still]

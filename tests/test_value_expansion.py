@@ -1,0 +1,173 @@
+"""Targets of the critics that go on in the simulator, against a plain loop over the environment."""
+
+import numpy as np
+import pytest
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
+
+from sb3_mcbs import MCBSDDPG, MCBSSAC, MCBSTD3, MCBSTQC
+from sb3_mcbs.algorithms.networks import policy_function
+from sb3_mcbs.algorithms.value_expansion import ValueExpansion
+from sb3_mcbs.models import ForwardModelError
+from tests.conftest import snapshot_vec_env
+
+AGENTS = [MCBSTD3, MCBSDDPG, MCBSSAC, MCBSTQC]
+STEPS = 3
+GAMMA = 0.9
+
+
+class Snapshots(BaseCallback):
+    """Takes a snapshot of every environment after every step, as the replay buffer's rows are counted."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.taken: list[list] = []
+
+    def _on_step(self) -> bool:
+        self.taken.append(self.training_env.env_method("snapshot"))
+        return True
+
+
+class FixedRows:
+    """Stands for a generator that draws known places of a replay buffer."""
+
+    def __init__(self, rows, envs):
+        self.draws = [np.asarray(rows), np.asarray(envs)]
+
+    def integers(self, low, high, size):
+        return self.draws.pop(0)
+
+
+def trained(make_agent, env_id="Hopper-v5", n_envs=2, cls=MCBSTD3, env=None, **settings):
+    settings = dict(value_expansion=STEPS, gamma=GAMMA, search_share=0.5) | settings
+    if cls in (MCBSTD3, MCBSDDPG):
+        n_actions = make_agent(env_id).action_space.shape[0]
+        settings["action_noise"] = NormalActionNoise(np.zeros(n_actions), 0.3 * np.ones(n_actions))
+    agent = make_agent(env or snapshot_vec_env(env_id, n_envs), cls=cls, **settings)
+    snapshots = Snapshots()
+    agent.learn(60 * n_envs, callback=snapshots)
+    return agent, snapshots.taken
+
+
+def go_on(agent, env, snapshot, reward, next_observation):
+    """The return of a transition that goes on with the target actor, by the environment's own step.
+
+    :return: return, how many steps, whether it terminated, last observation.
+    """
+    policy, normalizer = policy_function(agent, target=True), agent.get_vec_normalize_env()
+
+    def seen(observation):
+        observation = np.asarray(observation)[None]
+        return observation if normalizer is None else normalizer.normalize_obs(observation)
+
+    def scaled(reward):
+        return reward if normalizer is None else float(normalizer.normalize_reward(np.array(reward)))
+
+    env.restore(snapshot)
+    total, observation, terminated = scaled(reward), next_observation, False
+    for length in range(1, STEPS + 1):
+        action = agent.policy.unscale_action(policy(seen(observation)))[0]
+        observation, reward, terminated, _, _ = env.step(action)
+        total += GAMMA**length * scaled(reward)
+        if terminated:
+            return total, length + 1, True, observation
+    return total, STEPS + 1, False, observation
+
+
+@pytest.mark.parametrize("normalized", [False, True])
+@pytest.mark.parametrize(("env_id", "cls"), [("Hopper-v5", MCBSTD3), ("HalfCheetah-v5", MCBSSAC)])
+def test_samples_are_those_of_a_plain_loop(make_agent, env_id, cls, normalized):
+    vec_env = VecNormalize(snapshot_vec_env(env_id, 2)) if normalized else snapshot_vec_env(env_id, 2)
+    agent, taken = trained(make_agent, env_id, cls=cls, env=vec_env)
+    buffer, env = agent.replay_buffer, snapshot_vec_env(env_id).envs[0]
+    env.reset(seed=0)
+    rows, envs = (index.ravel() for index in np.meshgrid(np.arange(buffer.size()), np.arange(2)))
+    expansion = ValueExpansion(agent, agent._searcher)
+    before = agent.n_simulated_steps
+    sample = expansion.sample(len(rows), GAMMA, FixedRows(rows, envs), agent.get_vec_normalize_env())
+    simulated, n_terminated = 0, 0
+    for index, (row, number) in enumerate(zip(rows, envs, strict=True)):
+        reward, last = buffer.rewards[row, number], buffer.next_observations[row, number]
+        if buffer.dones[row, number]:
+            expected = None
+            assert sample.discounts[index] == pytest.approx(GAMMA)
+            assert sample.dones[index] == 1 - buffer.timeouts[row, number]
+            continue
+        expected, length, terminated, last = go_on(agent, env, taken[row][number], reward, last)
+        simulated += length - 1
+        n_terminated += terminated
+        assert sample.rewards[index].item() == pytest.approx(expected, rel=1e-4, abs=1e-4)
+        assert sample.discounts[index].item() == pytest.approx(GAMMA**length)
+        assert sample.dones[index].item() == terminated
+        seen = last if not normalized else vec_env.normalize_obs(last)
+        np.testing.assert_allclose(sample.next_observations[index], seen, rtol=1e-4, atol=1e-5)
+    np.testing.assert_array_equal(sample.actions, buffer.actions[rows, envs])
+    assert agent.n_simulated_steps - before == simulated
+    assert (n_terminated > 0) == (env_id == "Hopper-v5"), "terminations are covered where there are any"
+
+
+@pytest.mark.parametrize("cls", AGENTS)
+def test_agents_learn_from_both_parts(make_agent, cls, monkeypatch):
+    sizes = []
+    sample = ValueExpansion.sample
+    monkeypatch.setattr(
+        ValueExpansion,
+        "sample",
+        lambda self, n, *args: sizes.append(n) or sample(self, n, *args),
+    )
+    agent, _ = trained(make_agent, n_envs=1, cls=cls, batch_size=32, expanded_share=0.25)
+    assert set(sizes) == {8} and agent._n_updates == len(sizes)
+
+
+def test_with_rollout_replay_and_worker_processes(make_agent):
+    env = snapshot_vec_env("Hopper-v5", 2, vec_env_cls=SubprocVecEnv)
+    agent, _ = trained(make_agent, env=env, rollout_replay=0.5, expanded_share=0.5)
+    assert agent.replay_buffer.expansion_held.any() and agent._rollouts is not None
+    env.close()
+
+
+def test_nothing_else_is_drawn_differently(make_agent):
+    """The search, the noise and the environments see no difference as long as nothing is learned."""
+    plain, expanded = (
+        trained(make_agent, n_envs=1, value_expansion=steps, gradient_steps=0)[0] for steps in (0, STEPS)
+    )
+    np.testing.assert_array_equal(plain.replay_buffer.actions, expanded.replay_buffer.actions)
+    np.testing.assert_array_equal(plain.replay_buffer.rewards, expanded.replay_buffer.rewards)
+
+
+def test_states_are_saved_with_the_replay_buffer(make_agent, tmp_path):
+    agent, _ = trained(make_agent)
+    agent.save(tmp_path / "agent")
+    agent.save_replay_buffer(tmp_path / "buffer")
+    loaded = MCBSTD3.load(tmp_path / "agent", env=agent.get_env())
+    assert loaded.value_expansion == STEPS
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    for name in ("expansion_states", "expansion_held"):
+        np.testing.assert_array_equal(getattr(loaded.replay_buffer, name), getattr(agent.replay_buffer, name))
+    loaded.learn(20, reset_num_timesteps=False)
+
+
+@pytest.mark.parametrize(
+    ("settings", "error", "words"),
+    [
+        (dict(value_expansion=-1), ValueError, "value_expansion"),
+        (dict(value_expansion=1.5), TypeError, "value_expansion"),
+        (dict(value_expansion=1, expanded_share=0.0), ValueError, "expanded_share above 0"),
+        (dict(value_expansion=1, rollout_depth=0, n_simulations=1), ValueError, "rollout_depth of 1"),
+        (dict(value_expansion=1, rollout_replay=0.6), ValueError, "must not exceed 1"),
+        (
+            dict(
+                value_expansion=1,
+                optimize_memory_usage=True,
+                replay_buffer_kwargs=dict(handle_timeout_termination=False),
+            ),
+            ValueError,
+            "optimize_memory_usage",
+        ),
+        (dict(value_expansion=1, forward_model="pool"), ForwardModelError, "batched MuJoCo"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(make_agent, settings, error, words):
+    with pytest.raises(error, match=words):
+        make_agent("InvertedPendulum-v5", **settings)
