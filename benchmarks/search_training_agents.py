@@ -10,7 +10,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_mcbs import MCBSTD3
-from sb3_mcbs.algorithms.td3_update import FastUpdate, TD3Update, _adam_step, _pairs
+from sb3_mcbs.algorithms.td3_update import FastUpdate, TD3Update, _adam_step
 from sb3_mcbs.search import search
 from sb3_mcbs.search.strategies import Decision
 
@@ -51,9 +51,6 @@ class PlanningTD3(MCBSTD3):
     :param imitation: weight of the squared distance between the actor's action and the searched one, at
         searched transitions, in units of the critics' mean absolute value.
     :param replan: whether old searched actions are planned again, a few at a time.
-    :param expansion: steps of the present target actor, from the stored state, in the critics' targets;
-        the first is the stored action. 1: as TD3.
-    :param expanded_share: of a batch.
     """
 
     def __init__(
@@ -61,12 +58,9 @@ class PlanningTD3(MCBSTD3):
         *args: Any,
         imitation: float = 0.0,
         replan: bool = False,
-        expansion: int = 1,
-        expanded_share: float = 0.5,
         **kwargs: Any,
     ) -> None:
         self.imitation, self.replan = imitation, replan
-        self.expansion, self.expanded_share = expansion, expanded_share
         self.n_learning_steps = 0
         super().__init__(*args, **{"replay_buffer_class": RowsReplayBuffer, **kwargs})
 
@@ -103,38 +97,9 @@ class PlanningUpdate(TD3Update):
 
     def _targets(self, data: ReplayBufferSamples) -> th.Tensor:
         targets = super()._targets(data)
-        if self._agent.expansion > 1:
-            n = round(self._agent.expanded_share * targets.shape[1])
-            targets[0, :n] = th.as_tensor(self._expanded(data.actions[:n].numpy()), dtype=th.float32)
         if self._agent.replan and self._agent._n_updates % REPLAN_EVERY == 0:
             self._plan_again()
         return targets
-
-    def _expanded(self, actions: np.ndarray) -> np.ndarray:
-        """Simulate stored actions, and then what the target actor does.
-
-        :param actions: ``[n, act_dim]``, of the first rows of the batch.
-        :return: ``[n]`` targets.
-        """
-        agent, searcher = self._agent, self._agent._searcher
-        assert searcher is not None and searcher.model is not None and agent.search_rng is not None
-        n = len(actions)
-        roots = [self._buffer.roots[row] for row in self._buffer.rows[:n]]
-        searcher.model.set_roots(roots, np.arange(n), agent.search_rng)
-        targets, discount, alive = np.zeros(n), 1.0, np.ones(n, dtype=bool)
-        for _ in range(agent.expansion):
-            step = searcher.model.step(searcher.unscale(actions))
-            agent.n_learning_steps += n
-            targets += np.where(alive, discount * step.rewards, 0.0)
-            alive &= ~step.terminated
-            discount *= agent.gamma
-            observations = th.as_tensor(np.asarray(step.observations), dtype=th.float32)
-            actions = self._actor_target(observations.t()).t().numpy()
-        noise = th.empty(actions.shape).normal_(0, agent.target_policy_noise)
-        noise.clamp_(-agent.target_noise_clip, agent.target_noise_clip)
-        pairs = _pairs(observations, (th.as_tensor(actions) + noise).clamp_(-1, 1))
-        values = th.cat([critic(pairs) for critic in self._critic_targets]).amin(dim=0).numpy()
-        return targets + np.where(alive, discount * values, 0.0)
 
     def _plan_again(self) -> None:
         agent, searcher, buffer = self._agent, self._agent._searcher, self._buffer

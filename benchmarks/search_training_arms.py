@@ -23,6 +23,8 @@ EFFICIENT: dict[str, Any] = {
     "include_policy_action": True,
 }
 HALF: dict[str, Any] = {"search_share": 0.5, "search_unit": "episode"}
+#: Targets of 3 steps, of which two are simulated, for half of every batch.
+EXPANSION: dict[str, Any] = {"value_expansion": 2}
 ON_TOP: dict[str, Any] = {"action_noise_after_search": True}
 
 ARMS: dict[str, tuple[type[TD3], dict[str, Any]]] = {
@@ -44,6 +46,7 @@ ARMS: dict[str, tuple[type[TD3], dict[str, Any]]] = {
     "half_noise_replay25": (MCBSTD3, EFFICIENT | HALF | ON_TOP | {"rollout_replay": 0.25}),
     "replay25": (MCBSTD3, EFFICIENT | {"search_share": 0.0, "rollout_replay": 0.25}),
     "half_imitation": (PlanningTD3, EFFICIENT | HALF | {"imitation": 0.1, "replan": True}),
-    "half_expansion": (PlanningTD3, EFFICIENT | HALF | {"expansion": 3}),
-    "expansion": (PlanningTD3, EFFICIENT | {"search_share": 0.0, "expansion": 3}),
+    "half_expansion": (MCBSTD3, EFFICIENT | HALF | EXPANSION),
+    "expansion": (MCBSTD3, EFFICIENT | EXPANSION | {"search_share": 0.0}),
+    "efficient_expansion": (MCBSTD3, EFFICIENT | EXPANSION),
 }
