@@ -1,6 +1,6 @@
 """Shared pieces of the tests."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from copy import deepcopy
 
 import gymnasium as gym
@@ -14,6 +14,8 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_mcbs import MCBS, MCBSDDPG, MCBSSAC, MCBSTD3, MCBSTQC, SnapshotEnvWrapper
+from sb3_mcbs.algorithms import learned_model
+from sb3_mcbs.models import ensemble, ensemble_network
 
 # Small networks are fastest on one thread, and idle OpenMP threads would take cores from the simulations.
 th.set_num_threads(1)
@@ -59,6 +61,16 @@ def make_agent() -> Callable[..., MCBS]:
 @pytest.fixture
 def make_dict_env() -> Callable[[], gym.Env]:
     return lambda: DictPendulum(gym.make("Pendulum-v1"))
+
+
+@pytest.fixture(scope="module")
+def small_ensembles() -> Iterator[None]:
+    """Learned models with networks that are fitted in no time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ensemble_network, "HIDDEN", (24, 24))
+        patch.setattr(ensemble, "BATCH_SIZE", 64)
+        patch.setattr(learned_model, "LEAST_TRANSITIONS", 100)
+        yield
 
 
 def snapshot_vec_env(env_id: str, n_envs: int = 1, **kwargs):

@@ -61,3 +61,19 @@ def test_scaling_and_memory_and_deadline(monkeypatch):
     assert deadline.measure("Pendulum-v1", 0.05, 20)["candidates"] > 0
     path = common.write("nothing", [1.5])
     assert json.loads(path.read_text())["results"] == [1.5]
+
+
+def test_learned_model(monkeypatch, tmp_path):
+    from benchmarks import common, learned_model
+
+    monkeypatch.setattr(common, "RESULTS", tmp_path)
+    monkeypatch.setattr(learned_model, "EPISODES", 1)
+    arguments = "learned --env Pendulum-v1 --steps 620 --learning-starts 520 --max-error 2"
+    monkeypatch.setattr("sys.argv", ["learned_model", *arguments.split()])
+    learned_model.main()
+    (path,) = tmp_path.glob("learned_model-Pendulum-v1-learned-0.json")
+    results = json.loads(path.read_text())["results"]
+    assert results["decisions searched"] == 99 and results["held-out error"] < 2
+    assert set(results["returns"]) == {"actor", "search, ensemble"}
+    errors = [row["observation error"] for row in results["error over horizon"]]
+    assert len(errors) == 5 and errors[0] < errors[-1]

@@ -21,8 +21,8 @@ def explore_without_search(agent: OffPolicyAlgorithm, noise: float) -> None:
     if agent.action_noise is not None or isinstance(agent, SAC | TQC):
         return
     message = (
-        "action_noise is None, and search_share leaves decisions to the actor: Gaussian noise of "
-        f"beam_noise={noise} acts there. Pass an action_noise to choose another."
+        "action_noise is None, and not every decision is searched: where the actor acts, Gaussian noise of "
+        f"beam_noise={noise} is added. Pass an action_noise to choose another."
     )
     logger.info(message)
     if agent.verbose >= 1:

@@ -5,12 +5,18 @@ from collections.abc import Mapping
 from dataclasses import Field, fields
 from typing import Any, TypedDict
 
+from sb3_mcbs.algorithms.learned_model import EnsembleSettings
 from sb3_mcbs.algorithms.rollout_replay import RolloutReplaySettings
 from sb3_mcbs.search import ScheduleSettings, SearchSettings, with_preset
 from sb3_mcbs.search.checks import CheckedSettings
 
 #: What an agent's constructor takes besides SB3's parameters, as attributes of the same names.
-SETTINGS: tuple[type[CheckedSettings], ...] = (SearchSettings, ScheduleSettings, RolloutReplaySettings)
+SETTINGS: tuple[type[CheckedSettings], ...] = (
+    SearchSettings,
+    ScheduleSettings,
+    RolloutReplaySettings,
+    EnsembleSettings,
+)
 
 _SEARCH_SETTINGS = "search_settings"
 
@@ -53,6 +59,11 @@ class SearchKeywords(TypedDict, total=False):
     saturation_tolerance: float
     recovery_tolerance: float
     rollout_replay: float
+    ensemble_size: int
+    ensemble_train_freq: int
+    ensemble_gradient_steps: int
+    ensemble_max_error: float
+    ensemble_pessimism: float
 
 
 class SearchAttributes:
@@ -93,6 +104,11 @@ class SearchAttributes:
     saturation_tolerance: float
     recovery_tolerance: float
     rollout_replay: float
+    ensemble_size: int
+    ensemble_train_freq: int
+    ensemble_gradient_steps: int
+    ensemble_max_error: float
+    ensemble_pessimism: float
 
 
 def list_search_settings(cls: type) -> None:

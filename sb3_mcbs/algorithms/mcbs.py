@@ -24,6 +24,8 @@ from sb3_mcbs.algorithms.faults import (
     warn_of_divergence,
 )
 from sb3_mcbs.algorithms.keywords import SearchAttributes, complete_settings, list_search_settings
+from sb3_mcbs.algorithms.learned_model import EnsembleSettings, LearnedModel, set_up_learned_model
+from sb3_mcbs.algorithms.learned_search import make_searcher
 from sb3_mcbs.algorithms.rollout_replay import RolloutReplay, RolloutReplaySettings, mixed_batches
 from sb3_mcbs.algorithms.searcher import Searcher
 from sb3_mcbs.algorithms.torch_settings import matmul_precision
@@ -67,8 +69,8 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         Take over the constructor's arguments for the search.
 
         :param action_noise_after_search: add ``action_noise`` to searched actions too
-        :param settings: fields of :data:`SETTINGS`; those not given have their defaults
-        :param preset: where they start from, see :func:`~sb3_mcbs.search.with_preset`
+        :param settings: fields of :data:`SETTINGS`; those not given are the preset's, or the defaults
+        :param preset: see :func:`~sb3_mcbs.search.with_preset`
         :raises TypeError: if there is no such setting
         :raises ValueError: if there is no such preset
         """
@@ -90,6 +92,7 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         self._decision: tuple[SearchResult, Sequence[int]] | None = None
         self._rollouts: Rollouts | None = None
         self.rollout_rng: np.random.Generator | None = None
+        self.learned_model: LearnedModel | None = None
         self._checked_env: CheckedVecEnv | None = None
 
     @property
@@ -106,8 +109,7 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         # ``load`` sets attributes without calling the constructor, so settings are checked here.
         if self.preset != self._preset_taken_over:
             raise ValueError(
-                f"preset={self.preset!r} is for constructors. Give the settings of a saved agent one by one: "
-                f"load(path, **PRESETS[{self.preset!r}])."
+                f"preset={self.preset!r} is for constructors; load takes **PRESETS[{self.preset!r}] instead."
             )
         settings, schedule = self.search_settings, self.schedule_settings
         schedule.check_search(settings)
@@ -129,6 +131,7 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
             RolloutReplay(self.replay_buffer, *schedule.most_rollouts(settings))  # makes room in it
         if self.rollout_rng is None:
             self.rollout_rng = np.random.default_rng(self.seed)
+        set_up_learned_model(self)
         if self.env is not None:
             self._make_searcher(self.env, settings)
 
@@ -146,7 +149,7 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         # What this environment's VecNormalize does is what the critics learn from.
         normalizer = unwrap_vec_normalize(env)
         normalize_reward = normalizer is not None and normalizer.norm_reward
-        self._searcher = Searcher(self, env, settings, normalize_reward, self.recent_actions)
+        self._searcher = make_searcher(self, env, settings, normalize_reward, self.recent_actions)
         if self.verbose >= 1:
             print(f"Forward model: {self._searcher.description}")
 
@@ -162,6 +165,8 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
             if self._schedule is not None:
                 self._schedule.rng = np.random.default_rng(seed)
             self.rollout_rng = np.random.default_rng(seed)
+            if self.learned_model is not None:
+                self.learned_model.rng = np.random.default_rng(seed)
 
     def _sample_action(
         self,
@@ -190,7 +195,9 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
             raise
         if self.num_timesteps < learning_starts:
             return actions, scaled_actions
-        assert self._schedule is not None
+        assert self._schedule is not None and self._searcher is not None
+        if not self._searcher.ready:
+            return actions, scaled_actions
         self.logger.record("search/frequency", self._schedule.share(self._progress))
         executed = self._schedule.draw(self._progress, self.num_timesteps)
         # Rollouts to learn from are wanted everywhere.
@@ -244,7 +251,7 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
     ) -> None:
         normalizer = self._vec_normalize_env
         raw_reward = reward if normalizer is None else normalizer.get_original_reward()
-        assert self._schedule is not None
+        assert self._schedule is not None and self._searcher is not None
         self._schedule.note_step(raw_reward, dones, self.num_timesteps)
         diverged = diverged_environments(infos)
         if diverged and self.n_diverged_steps == 0:
@@ -255,10 +262,8 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
             leave_out_step(self, replay_buffer, new_obs)
             return
         if self.num_timesteps - self.n_envs >= self.learning_starts:  # random actions have no directions
-            assert self._searcher is not None
             self._searcher.note_actions(buffer_action)
         if self._decision is not None:
-            assert self._searcher is not None
             error = self._searcher.model_error(*self._decision, new_obs, raw_reward, infos)
             if error is not None:
                 self.logger.record_mean("search/model_error", error)
@@ -281,7 +286,7 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         *args: Any,
         **kwargs: Any,
     ) -> tuple[int, BaseCallback]:
-        if not self.schedule_settings.searches_always:
+        if not self.schedule_settings.searches_always or self.learned_model is not None:
             explore_without_search(self, self.beam_noise)
         will_reset = reset_num_timesteps or self._last_obs is None
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args, **kwargs)
@@ -298,6 +303,8 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         :param gradient_steps: how many gradient steps to do
         :param batch_size: transitions sampled for each
         """
+        if self.learned_model is not None:
+            self.learned_model.fit_if_due(self, EnsembleSettings.of(self))
         with matmul_precision(self.matmul_precision), self._learning_from_rollouts():
             super().train(gradient_steps, batch_size)
 

@@ -57,6 +57,11 @@ class RolloutReplaySettings(CheckedSettings):
             raise ValueError(
                 "rollout_replay needs a rollout_depth of 1 or more: with 0 there are no rollouts."
             )
+        if settings.forward_model == "ensemble":
+            raise ValueError(
+                "rollout_replay learns from exact simulations; those of forward_model='ensemble' are not: "
+                "leave one of the two out."
+            )
         if settings.strategy != "beam" or settings.time_budget is not None:
             raise ValueError(
                 "rollout_replay needs strategy='beam' without a time_budget: only there are rollouts those "

@@ -9,8 +9,8 @@ import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
+from sb3_mcbs.algorithms.learned_search import make_searcher
 from sb3_mcbs.algorithms.mcbs import MCBS
-from sb3_mcbs.algorithms.searcher import Searcher
 from sb3_mcbs.search import SearchResult, SearchSettings, with_preset
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 
@@ -66,7 +66,7 @@ class SearchPolicy:
         self.last_result: SearchResult | None = None
         # A copy, so that acting elsewhere does not change the training.
         recent_actions = deepcopy(model.recent_actions) if isinstance(model, MCBS) else None
-        self.searcher = Searcher(model, self.vec_env, self.settings, normalize_reward, recent_actions)
+        self.searcher = make_searcher(model, self.vec_env, self.settings, normalize_reward, recent_actions)
 
     def predict(
         self,

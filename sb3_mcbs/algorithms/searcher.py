@@ -19,8 +19,14 @@ from sb3_mcbs.algorithms.networks import (
     policy_function,
     value_function,
 )
+from sb3_mcbs.algorithms.observations import difference, equal, n_rows, row_of
 from sb3_mcbs.algorithms.torch_settings import matmul_precision, one_thread
-from sb3_mcbs.algorithms.vec_env_view import VecEnvView, reward_normalizer, snapshot_environments
+from sb3_mcbs.algorithms.vec_env_view import (
+    AgentView,
+    VecEnvView,
+    reward_normalizer,
+    snapshot_environments,
+)
 from sb3_mcbs.models import Environments, ForwardModel, ForwardModelError, make_forward_model
 from sb3_mcbs.models.base import Observations
 from sb3_mcbs.models.copies import stack
@@ -84,15 +90,27 @@ class Searcher:
         self._previous_step_differed = False
         self._pace = Pace()
         self._plans: PlanMemory | None = None
+        self.view: AgentView
         if settings.rollout_depth > 0:
-            self.view = VecEnvView(vec_env, reward_normalizer(agent.get_env(), vec_env, normalize_reward))
-            self.environments: Environments = snapshot_environments(self.view.base)
-            self._all_envs = range(len(self.environments))
-            self.model = make_forward_model(self.environments, settings.forward_model, settings.n_threads)
-            check_dynamics(settings, self.model.deterministic)
-            if settings.strategy == "refine":
-                self._plans = PlanMemory(len(self.environments), settings.horizon, self._act_dim)
+            self._connect(vec_env, normalize_reward)
         self._functions = self._agent_functions()
+
+    def _connect(self, vec_env: VecEnv, normalize_reward: bool | None) -> None:
+        """Make the forward model, and the view of the environments."""
+        agent, settings = self.agent, self.settings
+        view = VecEnvView(vec_env, reward_normalizer(agent.get_env(), vec_env, normalize_reward))
+        self.view = view
+        self.environments: Environments = snapshot_environments(view.base)
+        self._all_envs = range(len(self.environments))
+        self.model = make_forward_model(self.environments, settings.forward_model, settings.n_threads)
+        check_dynamics(settings, self.model.deterministic)
+        if settings.strategy == "refine":
+            self._plans = PlanMemory(len(self.environments), settings.horizon, self._act_dim)
+
+    @property
+    def ready(self) -> bool:
+        """Whether the forward model may be used already."""
+        return True
 
     @property
     def description(self) -> str:
@@ -123,19 +141,18 @@ class Searcher:
         start = self._pace.clock()
         if self.agent.policy.training:
             self.agent.policy.set_training_mode(False)
-        if envs is not None:
-            observations = take_rows(observations, np.asarray(envs))
         roots: list[Any] = []
         if self.model is not None:
             envs = self._all_envs if envs is None else envs
-            roots = self._read_roots(envs)
-            observations = self._present_observations(observations, envs)
+            roots, observations = self._look(observations, envs)
+        elif envs is not None:
+            observations = take_rows(observations, np.asarray(envs))
         agent, settings = self.agent_functions(), effort or self.settings
         dims = settings.proposal_dims
         directions = None if dims is None else self.recent_actions.directions(dims)
         with one_thread(), matmul_precision(settings.matmul_precision):
             if settings.time_budget is None:
-                shape = (_n_rows(observations), self._act_dim)
+                shape = (n_rows(observations), self._act_dim)
                 decision = Decision(self.model, roots, observations, agent, settings, shape, rng)
                 decision = decision._replace(record=record, directions=directions)
                 if self._plans is not None:
@@ -207,11 +224,11 @@ class Searcher:
             env = envs[row]
             real = infos[env].get("terminal_observation")
             if real is None:
-                real = _row(observations, env)
-            error = max(error, _difference(_row(predicted, row), real))
+                real = row_of(observations, env)
+            error = max(error, difference(row_of(predicted, row), real))
             # A vectorized environment hands rewards on as float32.
             error = max(
-                error, _difference(np.float32(result.first_step.rewards[row]), np.float32(rewards[env]))
+                error, difference(np.float32(result.first_step.rewards[row]), np.float32(rewards[env]))
             )
         if error > 0:
             self._follow_environment(f"The forward model's prediction differs from reality by {error:.3g}. ")
@@ -290,8 +307,18 @@ class Searcher:
         unscaled += self._low
         return unscaled
 
+    def _look(self, observations: Observations, envs: Sequence[int]) -> tuple[list[Any], Observations]:
+        """Where the rollouts start: roots, and the observations there as the forward model has them.
+
+        :param observations: ``[n_envs, *]``, of all environments as the agent was given them.
+        :param envs: which environments.
+        """
+        roots = self._read_roots(envs)
+        return roots, self._present_observations(take_rows(observations, np.asarray(envs)), envs)
+
     def _present_observations(self, observations: Observations, envs: Sequence[int]) -> Observations:
         """The environments' own observations, checked against those that the agent was given."""
+        assert isinstance(self.view, VecEnvView)
         present = self.environments.apply(envs, _last_observation)
         for row, observation in enumerate(present):
             if observation is None:
@@ -299,7 +326,7 @@ class Searcher:
         if any(observation is None for observation in present):
             raise ValueError("Reset the vectorized environment before the first search.")
         stacked = stack(present)
-        if not _equal(self.view.observe(stacked), observations):
+        if not equal(self.view.observe(stacked), observations):
             check_observations(stacked)  # NaN is not equal to itself
             raise ValueError(
                 "The observations to act on are not those of the environments' present states. A search "
@@ -386,31 +413,3 @@ def _last_observation(env: SnapshotEnvWrapper) -> Any:
 
 def _moment(env: SnapshotEnvWrapper) -> Moment:
     return env.moment
-
-
-def _row(observations: Observations, index: int) -> Any:
-    if isinstance(observations, dict):
-        return {key: value[index] for key, value in observations.items()}
-    return observations[index]
-
-
-def _n_rows(observations: Observations) -> int:
-    return len(next(iter(observations.values()))) if isinstance(observations, dict) else len(observations)
-
-
-def _equal(left: Observations, right: Observations) -> bool:
-    if isinstance(left, dict):
-        return isinstance(right, dict) and all(np.array_equal(left[key], right[key]) for key in left)
-    # What np.array_equal does, without its Python.
-    return not isinstance(right, dict) and left.shape == right.shape and bool((left == right).all())
-
-
-def _difference(left: Any, right: Any) -> float:
-    """Largest absolute difference; two NaNs are equal, a NaN and a number are infinitely far apart."""
-    if isinstance(left, dict):
-        return max(_difference(left[key], right[key]) for key in left)
-    left, right = np.asarray(left, np.float64), np.asarray(right, np.float64)
-    if np.array_equal(left, right, equal_nan=True):
-        return 0.0
-    difference = np.abs(left - right)
-    return float(np.where(np.isnan(difference), np.inf, difference).max())

@@ -32,8 +32,70 @@ _TRANSPARENT = (VecCheckNan, VecMonitor, VecVideoRecorder)
 _PURE = (VecNormalize, VecTransposeImage, VecExtractDictObs)
 
 
-class VecEnvView:
-    """Observations and rewards of a vectorized environment as an agent's networks see them.
+class AgentView:
+    """Observations and rewards as an agent's replay buffer keeps them, and as its networks see them.
+
+    Only ``VecNormalize`` is between the two, whatever other wrappers there are.
+
+    :param vec_env: the environment that the agent acts in.
+    :param reward_normalizer: the ``VecNormalize`` whose reward scale the critics learned, if any.
+    """
+
+    def __init__(self, vec_env: VecEnv, reward_normalizer: VecNormalize | None) -> None:
+        self.vec_env = vec_env
+        self.reward_normalizer = reward_normalizer
+
+    def observe(self, observations: Observations, normalize: bool = True) -> Observations:
+        """Turn observations of the replay buffer into those of the networks.
+
+        :param observations: ``[rows, *obs_shape]`` as replay buffers keep them.
+        :param normalize: False leaves them as they are.
+        :return: ``[rows, *]`` as the networks expect them.
+        """
+        normalizer = unwrap_vec_normalize(self.vec_env)
+        return observations if normalizer is None or not normalize else normalizer.normalize_obs(observations)
+
+    def original(self, observations: Observations) -> Observations:
+        """The last observations of all environments as replay buffers keep them.
+
+        :param observations: the same as the agent was given them.
+        :return: ``[n_envs, *obs_shape]``.
+        :raises ValueError: if the environment did not give these observations last.
+        """
+        normalizer = unwrap_vec_normalize(self.vec_env)
+        if normalizer is None:
+            return observations
+        original = normalizer.get_original_obs()
+        if not np.array_equal(normalizer.normalize_obs(original), observations):  # type: ignore[arg-type]
+            raise ValueError(
+                "The observations to act on are not those that the environment's VecNormalize gave last. Act "
+                "in the environment that the search was given."
+            )
+        return original
+
+    def unnormalize(self, observation: np.ndarray) -> np.ndarray:
+        """Undo what ``VecNormalize`` did to the last observation of an episode, as SB3 does.
+
+        :param observation: ``[*obs_shape]``.
+        """
+        normalizer = unwrap_vec_normalize(self.vec_env)
+        return observation if normalizer is None else normalizer.unnormalize_obs(observation)  # type: ignore[return-value]
+
+    def scale_reward(self, rewards: np.ndarray) -> np.ndarray:
+        """Bring rewards to the scale on which the critics were trained.
+
+        :param rewards: ``[rows]`` as the environments return them.
+        :return: ``[rows]``.
+        """
+        normalizer = self.reward_normalizer
+        if normalizer is None:
+            return rewards
+        scaled = rewards / np.sqrt(normalizer.ret_rms.var + normalizer.epsilon)
+        return np.clip(scaled, -normalizer.clip_reward, normalizer.clip_reward)
+
+
+class VecEnvView(AgentView):
+    """The same from the environments' own observations on, which other wrappers may alter too.
 
     :param vec_env: the environment that the agent acts in.
     :param reward_normalizer: the ``VecNormalize`` whose reward scale the critics learned, if any.
@@ -41,8 +103,7 @@ class VecEnvView:
     """
 
     def __init__(self, vec_env: VecEnv, reward_normalizer: VecNormalize | None) -> None:
-        self.vec_env = vec_env
-        self.reward_normalizer = reward_normalizer
+        super().__init__(vec_env, reward_normalizer)
         self.layers: list[VecEnvWrapper] = []
         while isinstance(vec_env, VecEnvWrapper):
             if type(vec_env) in _PURE:
@@ -86,18 +147,6 @@ class VecEnvView:
             else:
                 observations = observations[layer.key]
         return observations
-
-    def scale_reward(self, rewards: np.ndarray) -> np.ndarray:
-        """Bring rewards to the scale on which the critics were trained.
-
-        :param rewards: ``[rows]`` as the environments return them.
-        :return: ``[rows]``.
-        """
-        normalizer = self.reward_normalizer
-        if normalizer is None:
-            return rewards
-        scaled = rewards / np.sqrt(normalizer.ret_rms.var + normalizer.epsilon)
-        return np.clip(scaled, -normalizer.clip_reward, normalizer.clip_reward)
 
 
 def reward_normalizer(

@@ -3,6 +3,8 @@
 from sb3_mcbs.models import gymnasium_families as _families
 from sb3_mcbs.models import gymnasium_small_families as _small_families
 from sb3_mcbs.models.base import ForwardModel, ForwardModelError, Observations, Transition
+from sb3_mcbs.models.ensemble import Ensemble, Prediction, Transitions
+from sb3_mcbs.models.ensemble_model import EnsembleModel
 from sb3_mcbs.models.environments import Environments, LocalEnvironments, WorkerEnvironments
 from sb3_mcbs.models.factory import make_forward_model
 from sb3_mcbs.models.families import Constants, Family, Fields, Outcome, Rows, register_family
@@ -14,6 +16,8 @@ del _families, _small_families
 
 __all__ = [
     "Constants",
+    "Ensemble",
+    "EnsembleModel",
     "EnvPoolModel",
     "Environments",
     "Family",
@@ -24,8 +28,10 @@ __all__ = [
     "MujocoBatchModel",
     "Observations",
     "Outcome",
+    "Prediction",
     "Rows",
     "Transition",
+    "Transitions",
     "WorkerEnvironments",
     "WorkerError",
     "make_forward_model",

@@ -38,7 +38,7 @@ class ForwardModel(ABC):
 
     :ivar deterministic: whether the same state and action always give the same transition. A
         search then simulates the first step of a candidate once for all its simulations.
-    :ivar kind: the backend, ``"mujoco"`` or ``"pool"``; what ``forward_model=`` asks for.
+    :ivar kind: the backend, ``"mujoco"``, ``"pool"`` or ``"ensemble"``; what ``forward_model=`` asks for.
     :ivar description: one line for a log: which backend, and why if it was chosen by itself.
     """
 

@@ -9,7 +9,7 @@ from sb3_mcbs.models.pool import EnvPoolModel
 
 logger = logging.getLogger("sb3_mcbs")
 
-KINDS = ("auto", "mujoco", "pool")
+KINDS = ("auto", "mujoco", "pool", "ensemble")
 
 
 def make_forward_model(
@@ -24,11 +24,16 @@ def make_forward_model(
         process may use.
     :return: the model; its ``description`` says which it is, and why it is the pool.
     :raises ForwardModelError: with "mujoco", if it cannot simulate these environments.
-    :raises ValueError: for another kind.
+    :raises ValueError: for another kind, ``"ensemble"`` among them.
     """
     if kind not in KINDS:
         raise ValueError(f"unknown forward model {kind!r}; choose one of {', '.join(map(repr, KINDS))}")
     level, reason = logging.INFO, ""
+    if kind == "ensemble":
+        raise ValueError(
+            "An ensemble is learned by an agent, not made from environments: train one with "
+            "forward_model='ensemble', or fit an Ensemble and give it to EnsembleModel."
+        )
     if kind != "pool":
         try:
             batch = MujocoBatchModel(environments, n_threads)

@@ -39,8 +39,8 @@ class SearchSettings(CheckedSettings):
         candidate. ``False``, as in the paper, makes all candidates noisy.
     :param n_threads: threads that simulate. 0: one per available processor core. The result does not
         depend on it.
-    :param forward_model: ``"auto"``, ``"mujoco"`` (batched MuJoCo) or ``"pool"`` (copies of the
-        environment).
+    :param forward_model: ``"auto"``, ``"mujoco"`` (batched MuJoCo), ``"pool"`` (copies of the
+        environment) or ``"ensemble"`` (learned by the agent, for environments without snapshots).
     :param matmul_precision: internal precision of the networks' float32 products during a search, as in
         ``torch.set_float32_matmul_precision``: ``"medium"`` is quicker on processors that multiply bfloat16.
         ``None``: as the process has it.

@@ -1,0 +1,156 @@
+"""The model that an agent learns of its environment while it trains."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.preprocessing import get_action_dim
+
+from sb3_mcbs.models.ensemble import Ensemble, Transitions
+from sb3_mcbs.models.ensemble_model import check_observation_space
+from sb3_mcbs.search.checks import CheckedSettings
+
+#: One row of the replay buffer in so many is held out: always the last of them, so that a transition that was
+#: held out is never fitted later.
+HELD_OUT_EVERY = 10
+#: The model is fitted once there are so many transitions: fewer held-out ones would say nothing.
+LEAST_TRANSITIONS = 500
+
+
+@dataclass(frozen=True)
+class EnsembleSettings(CheckedSettings):
+    """What an agent learns a model of its environment with; used with ``forward_model="ensemble"``.
+
+    :param ensemble_size: networks in the model.
+    :param ensemble_train_freq: environment steps between two fits of the model.
+    :param ensemble_gradient_steps: most gradient steps of a fit.
+    :param ensemble_max_error: the agent searches once the model's held-out error is at most this, and acts as
+        it does without search until then and whenever the error is higher again. The error is the mean
+        absolute error of one step of held-out transitions as a part of the mean absolute deviation of what is
+        predicted, averaged over the entries of the observation and the reward: 0 is perfect, 1 as bad as
+        always predicting the mean change of observations and the mean reward.
+    :param ensemble_pessimism: how much the disagreement of the networks lowers a predicted reward: this times
+        the disagreement (1: as much as what is predicted varies) times the standard deviation of rewards.
+    :raises TypeError: if a value has the wrong type.
+    :raises ValueError: if a value is out of range.
+    """
+
+    ensemble_size: int = 5
+    ensemble_train_freq: int = 1000
+    ensemble_gradient_steps: int = 500
+    ensemble_max_error: float = 0.5
+    ensemble_pessimism: float = 1.0
+
+    def __post_init__(self) -> None:
+        # One network has nobody to disagree with.
+        self._set_integer("ensemble_size", 2, 100)
+        self._set_integer("ensemble_train_freq", 1, 10**9)
+        self._set_integer("ensemble_gradient_steps", 1, 10**6)
+        for name in ("ensemble_max_error", "ensemble_pessimism"):
+            self._set_number(name, 1e6)
+
+
+class LearnedModel:
+    """An ensemble, and what its training needs besides: part of an agent's state.
+
+    :param agent: the agent, with a replay buffer.
+    :param settings: of the model.
+
+    :ivar ensemble: the ensemble.
+    :ivar rng: draws its first weights and its batches, and nothing else does.
+    :raises ForwardModelError: if the agent's observations are not vectors of numbers.
+    :raises ValueError: if the replay buffer does not keep what is needed.
+    """
+
+    def __init__(self, agent: OffPolicyAlgorithm, settings: EnsembleSettings) -> None:
+        self.rng = np.random.default_rng(agent.seed)
+        size = settings.ensemble_size
+        obs_dim = spaces.flatdim(check_observation_space(agent.observation_space))
+        act_dim = get_action_dim(agent.action_space)
+        self.ensemble = Ensemble(size, obs_dim, act_dim, self.rng, agent.device)
+        #: Steps of the agent at the last fit.
+        self._fitted_at: int | None = None
+
+    def check(self, agent: OffPolicyAlgorithm, settings: EnsembleSettings) -> None:
+        """Refuse an agent that the model cannot learn from, and go to its device.
+
+        :param agent: the agent, set up.
+        :param settings: of the model.
+        :raises ValueError: says what does not fit.
+        """
+        size = self.ensemble.shape[0]
+        if settings.ensemble_size != size:
+            raise ValueError(
+                f"ensemble_size is {settings.ensemble_size}, and this agent has learned a model of {size} "
+                "networks: leave it as it was."
+            )
+        if getattr(agent.replay_buffer, "optimize_memory_usage", False):
+            raise ValueError(
+                "forward_model='ensemble' learns from the last observation of every episode, which a replay "
+                "buffer with optimize_memory_usage does not keep: leave that out."
+            )
+        self.ensemble.to(agent.device)
+
+    def fit_if_due(self, agent: OffPolicyAlgorithm, settings: EnsembleSettings) -> None:
+        """Fit the ensemble to the replay buffer if ``ensemble_train_freq`` steps have passed.
+
+        :param agent: the agent; the errors are written to its logger.
+        :param settings: of the model.
+        """
+        now, then = agent.num_timesteps, self._fitted_at
+        # The count of steps starts again with every learn() that resets it.
+        if then is None or not 0 <= now - then < settings.ensemble_train_freq:
+            assert agent.replay_buffer is not None
+            transitions, held_out = read_transitions(agent.replay_buffer)
+            if len(held_out) >= LEAST_TRANSITIONS and held_out.any():
+                self._fitted_at = now
+                self.ensemble.fit(transitions, held_out, settings.ensemble_gradient_steps, self.rng)
+        error = self.ensemble.held_out_error
+        agent.logger.record("search/model_ready", int(error <= settings.ensemble_max_error))
+        if self._fitted_at is not None:
+            agent.logger.record("model/held_out_error", error)
+            agent.logger.record("model/termination_error", self.ensemble.termination_error)
+
+
+def set_up_learned_model(agent: Any) -> None:
+    """Give an agent the model that its settings ask for, or take away one that they do not.
+
+    :param agent: an :class:`~sb3_mcbs.MCBS` agent with a replay buffer.
+    :raises ForwardModelError: if its observations are not vectors of numbers.
+    :raises ValueError: if a setting is wrong, or does not fit.
+    """
+    settings = EnsembleSettings.of(agent)
+    if agent.forward_model != "ensemble":
+        agent.learned_model = None
+        return
+    if agent.learned_model is None:
+        agent.learned_model = LearnedModel(agent, settings)
+    agent.learned_model.check(agent, settings)
+
+
+def read_transitions(buffer: ReplayBuffer) -> tuple[Transitions, np.ndarray]:
+    """What a replay buffer holds, without drawing from it, which would change what the agent draws.
+
+    :param buffer: with single steps and observations that are a Box.
+    :return: the transitions ``[n]`` of all rows and environments, and which of them are held out.
+    """
+    stored: Any = buffer
+    n_rows = stored.size()
+
+    def flat(array: np.ndarray) -> np.ndarray:
+        return array[:n_rows].reshape(n_rows * stored.n_envs, -1)
+
+    # A time limit ends an episode and is no termination.
+    terminated = flat(stored.dones) * (1 - flat(stored.timeouts))
+    transitions = Transitions(
+        flat(stored.observations),
+        flat(stored.actions),
+        flat(stored.next_observations),
+        flat(stored.rewards)[:, 0],
+        terminated[:, 0],
+    )
+    held_out = np.arange(n_rows) % HELD_OUT_EVERY == HELD_OUT_EVERY - 1
+    return transitions, np.repeat(held_out, stored.n_envs)
