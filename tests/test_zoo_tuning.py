@@ -87,6 +87,7 @@ def test_schedules_are_tuned_when_asked(
         "search_share": 0.5,
         "search_unit": "episode",
         "rollout_replay": 0.25,
+        "value_expansion": 2,
     }
     params = {**SEARCH, **drawn, "final_share_factor": 0.2}
     if schedule == "constant":
@@ -94,7 +95,7 @@ def test_schedules_are_tuned_when_asked(
     sampled = sample(params)
     assert sampled == sampler.convert_mcbs_params(params)
     assert sampled.get("final_search_share") == (None if schedule == "constant" else 0.1)
-    agent = make_agent(**sampled)
+    agent = make_agent("InvertedPendulum-v5", **sampled)
     assert {name: getattr(agent, name) for name in sampled} == sampled
     with pytest.raises(optuna.TrialPruned, match="rollout_replay needs a rollout_depth"):
         sample({**params, "rollout_depth": 0, "n_simulations": 1})
@@ -223,6 +224,27 @@ def test_invalid_combinations_do_not_end_a_study(tmp_path: Path, monkeypatch: py
     states = {(trial.params["n_simulations"], trial.state.name) for trial in trials}
     assert len(trials) == 4
     assert states == {(1, "COMPLETE"), (5, "PRUNED")}
+
+
+def test_what_the_simulator_cannot_do_does_not_end_a_study(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Pendulum is not simulated by batched MuJoCo, whose states value_expansion needs."""
+    monkeypatch.setenv(sampler.SWITCH, "schedules")
+    for name, values in {
+        "ROLLOUT_DEPTHS": (1,),
+        "N_SIMULATIONS": (1,),
+        "VALUE_EXPANSION": (0, 2),
+        "SCHEDULES": ("constant",),
+    }.items():
+        monkeypatch.setattr(sampler, name, values)
+    words = [*WORDS, "--n-trials", "4", "--sampler", "random", "--seed", "0", *PARAMS]
+    zoo_train(monkeypatch, tmp_path, "mcbs_td3", *words)
+    trials = load_study(tmp_path / "study.log").trials
+    states = {(trial.params["value_expansion"], trial.state.name) for trial in trials}
+    assert len(trials) == 4
+    assert states == {(0, "COMPLETE"), (2, "PRUNED")}
+    assert any("batched MuJoCo" in trial.user_attrs.get("pruned", "") for trial in trials)
 
 
 @pytest.mark.slow

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium as gym
+import optuna
 from rl_zoo3.exp_manager import ExperimentManager
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -14,6 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_mcbs.checkpoints import CheckpointError, ExactCheckpointCallback
 from sb3_mcbs.checkpoints.resume import continue_with
 from sb3_mcbs.checkpoints.resumption import Resumption
+from sb3_mcbs.models import ForwardModelError
 from sb3_mcbs.search import SearchSettings, with_preset
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 from sb3_mcbs.zoo.callbacks import SearchEvalCallback, SecondEvalCallback
@@ -115,6 +117,20 @@ class MCBSExperimentManager(ExperimentManager):
         if settings is not None:
             self.search_evaluation = _checked_search_evaluation(settings, self.algo)
         return super()._preprocess_hyperparams(hyperparams)
+
+    def objective(self, trial: optuna.Trial) -> float:
+        """
+        Evaluate a trial as RL Zoo does, and prune one that asks more of the simulator than it can.
+
+        :param trial: Optuna's trial
+        :return: the return that is maximised
+        :raises optuna.TrialPruned: also where RL Zoo prunes
+        """
+        try:
+            return super().objective(trial)
+        except ForwardModelError as reason:
+            trial.set_user_attr("pruned", str(reason))
+            raise optuna.TrialPruned(str(reason)) from reason
 
     def create_callbacks(self) -> None:
         """Create RL Zoo's callbacks, and the second evaluation just before the run's own."""

@@ -37,6 +37,7 @@ SEARCH_SHARES = (0.25, 0.5, 1.0)
 #: As parts of ``search_share``.
 FINAL_SEARCH_SHARES = (0.0, 0.2, 0.5)
 ROLLOUT_REPLAY = (0.0, 0.25, 0.5)
+VALUE_EXPANSION = (0, 1, 2, 4)
 
 #: A trial whose decisions cost more simulated steps than this would take days.
 MAX_SIMULATED_STEPS = 600
@@ -127,6 +128,7 @@ def _sample_schedule(trial: optuna.Trial) -> dict[str, Any]:
         "search_share": trial.suggest_categorical("search_share", SEARCH_SHARES),
         "search_unit": trial.suggest_categorical("search_unit", UNITS),
         "rollout_replay": trial.suggest_categorical("rollout_replay", ROLLOUT_REPLAY),
+        "value_expansion": trial.suggest_categorical("value_expansion", VALUE_EXPANSION),
     }
     if sampled["search_schedule"] != "constant":
         sampled["final_share_factor"] = trial.suggest_categorical("final_share_factor", FINAL_SEARCH_SHARES)
@@ -161,6 +163,8 @@ def _why_senseless(params: dict[str, Any], sampled: dict[str, Any], n_actions: i
         RolloutReplaySettings(**_of(params, RolloutReplaySettings)).check_search(settings)
     except ValueError as error:
         return str(error)
+    if params.get("value_expansion") and settings.rollout_depth == 0:
+        return "value_expansion needs a rollout_depth of 1 or more"
     if settings.simulated_steps(deterministic=False) > MAX_SIMULATED_STEPS:
         return f"a decision would simulate more than {MAX_SIMULATED_STEPS} steps"
     return None
