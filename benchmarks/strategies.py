@@ -189,6 +189,8 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
                     face = None if filled else "none"
                     panel.plot(*zip(*points, strict=True), marker, label=name, markerfacecolor=face)
         panel.set(xscale="log", xlabel="simulated steps per decision", ylabel="return", title=agent)
+        panel.set_xticks(BUDGETS, [str(budget) for budget in BUDGETS])
+        panel.minorticks_off()
         panel.legend(fontsize=8)
     figure.savefig(path, dpi=120)
 

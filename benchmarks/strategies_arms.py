@@ -48,6 +48,7 @@ ARMS: dict[str, dict[str, Any]] = {
     "refine 3x1x(3x2)": refine(3, 1, 3, noise_hold=2),
     # about 60
     "beam 10x6": beam(10, 6),
+    "beam 10x6 in 3": beam(10, 6, proposal_dims=3),
     "beam 10x(3x2)": beam(10, 3, noise_hold=2),
     "tree 5x2x6": tree(5, 2, 6),
     "refine 7x3x3": refine(7, 3, 3),
@@ -65,6 +66,8 @@ ARMS: dict[str, dict[str, Any]] = {
     "refine 18x1x6": refine(18, 1, 6),
     "refine 9x2x(3x2)": refine(9, 2, 3, noise_hold=2),
     "refine 9x2x6 in 3": refine(9, 2, 6, proposal_dims=3),
+    "refine 9x2x6 in 2": refine(9, 2, 6, proposal_dims=2),
+    "refine 12x3x3 in 3": refine(12, 3, 3, proposal_dims=3),
     # about 580
     "beam 96x6": beam(96, 6),
     "tree 16x6x6": tree(16, 6, 6),

@@ -17,8 +17,10 @@ WORKERS = "Pendulum-v1 in workers"
 ENDLESS = 1_000_000
 
 
-def start_and_wait(folder: Path, case: str, steps: int = ENDLESS, save_freq: int = 100):
-    process = start("mcbs_td3", case, folder, steps, save_freq)
+def start_and_wait(
+    folder: Path, case: str, steps: int = ENDLESS, save_freq: int = 100, algorithm: str = "mcbs_td3"
+):
+    process = start(algorithm, case, folder, steps, save_freq)
     assert wait_until((folder / STARTED).exists, process, 120), (folder / "output.txt").read_text()
     return process
 
@@ -65,12 +67,16 @@ def test_a_second_signal_stops_at_once(tmp_path):
     assert "KeyboardInterrupt" in (tmp_path / "output.txt").read_text()
 
 
-def test_killed_while_writing(tmp_path):
+@pytest.mark.parametrize(
+    "algorithm",
+    ["mcbs_td3", *(pytest.param(f"mcbs_{base}", marks=pytest.mark.slow) for base in ("ddpg", "sac", "tqc"))],
+)
+def test_killed_while_writing(tmp_path, algorithm):
     """The small version of ``make bench-kill``: one SIGKILL inside a checkpoint, against a whole run."""
-    whole = start("mcbs_td3", "Pendulum-v1", tmp_path / "whole", 600, 100)
-    process = start_and_wait(tmp_path / "killed", "Pendulum-v1", 600)
+    whole = start(algorithm, "Pendulum-v1", tmp_path / "whole", 600, 100)
+    process = start_and_wait(tmp_path / "killed", "Pendulum-v1", 600, algorithm=algorithm)
     assert kill_once(process, tmp_path / "killed", True, 0.3) is not None
-    assert start("mcbs_td3", "Pendulum-v1", tmp_path / "killed", 600, 100).wait(120) == 0
+    assert start(algorithm, "Pendulum-v1", tmp_path / "killed", 600, 100).wait(120) == 0
     assert whole.wait(120) == 0
     assert differences(tmp_path / "whole", tmp_path / "killed") == []
     assert len(np.load(tmp_path / "whole" / RESULT).files) > 50

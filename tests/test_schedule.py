@@ -217,7 +217,7 @@ def test_only_searched_rows_are_read_and_simulated(make_agent, monkeypatch, env_
     )
 
     def search(envs):
-        monkeypatch.setattr("sb3_mcbs.search.strategies.draw_noise", lambda *args: noise.of(envs))
+        monkeypatch.setattr("sb3_mcbs.search.strategies.draw_noise", lambda *args, **kwargs: noise.of(envs))
         return searcher.search(agent._last_obs, rng, envs)
 
     some = search([1, 3])

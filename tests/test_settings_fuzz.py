@@ -6,6 +6,7 @@ minutes and gigabytes, and differs from a small one in nothing but that.
 
 import math
 import warnings
+from copy import deepcopy
 from fractions import Fraction
 from typing import Any
 
@@ -137,7 +138,10 @@ def test_settings_are_refused_or_search_a_small_world(kwargs: dict[str, Any]) ->
 def pendulums() -> dict[str, tuple[MCBSTQC, Any]]:
     """An agent that no setting is refused for and its environments, for each kind of forward model."""
     return {
-        env_id: (MCBSTQC("MlpPolicy", env_id, seed=0, n_threads=1, **SMALL), snapshot_vec_env(env_id, 2))
+        env_id: (
+            MCBSTQC("MlpPolicy", env_id, seed=0, n_threads=1, **deepcopy(SMALL)),
+            snapshot_vec_env(env_id, 2),
+        )
         for env_id in ("Pendulum-v1", "InvertedPendulum-v5")
     }
 
@@ -168,6 +172,7 @@ OWN = {
     **VALID,
     "action_noise_after_search": st.booleans(),
     "fast_update": st.booleans(),
+    "preset": st.sampled_from([None, "paper", "efficient", "balanced"]),
     "action_noise": st.sampled_from([None, NormalActionNoise(np.zeros(1), np.ones(1))]),
 }
 one_own = st.sampled_from(sorted(OWN)).flatmap(

@@ -69,8 +69,8 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         Take over the constructor's arguments for the search.
 
         :param action_noise_after_search: add ``action_noise`` to searched actions too
-        :param settings: fields of :data:`SETTINGS`; those not given have their defaults
-        :param preset: where they start from, see :func:`~sb3_mcbs.search.with_preset`
+        :param settings: fields of :data:`SETTINGS`; those not given are the preset's, or the defaults
+        :param preset: see :func:`~sb3_mcbs.search.with_preset`
         :raises TypeError: if there is no such setting
         :raises ValueError: if there is no such preset
         """
@@ -109,8 +109,7 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         # ``load`` sets attributes without calling the constructor, so settings are checked here.
         if self.preset != self._preset_taken_over:
             raise ValueError(
-                f"preset={self.preset!r} is for constructors. Give the settings of a saved agent one by one: "
-                f"load(path, **PRESETS[{self.preset!r}])."
+                f"preset={self.preset!r} is for constructors; load takes **PRESETS[{self.preset!r}] instead."
             )
         settings, schedule = self.search_settings, self.schedule_settings
         schedule.check_search(settings)
@@ -252,7 +251,7 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
     ) -> None:
         normalizer = self._vec_normalize_env
         raw_reward = reward if normalizer is None else normalizer.get_original_reward()
-        assert self._schedule is not None
+        assert self._schedule is not None and self._searcher is not None
         self._schedule.note_step(raw_reward, dones, self.num_timesteps)
         diverged = diverged_environments(infos)
         if diverged and self.n_diverged_steps == 0:
@@ -263,10 +262,8 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
             leave_out_step(self, replay_buffer, new_obs)
             return
         if self.num_timesteps - self.n_envs >= self.learning_starts:  # random actions have no directions
-            assert self._searcher is not None
             self._searcher.note_actions(buffer_action)
         if self._decision is not None:
-            assert self._searcher is not None
             error = self._searcher.model_error(*self._decision, new_obs, raw_reward, infos)
             if error is not None:
                 self.logger.record_mean("search/model_error", error)
