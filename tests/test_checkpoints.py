@@ -74,6 +74,18 @@ RUNS = {
     ),
     "MCBSTD3, pool": maker(MCBSTD3, forward_model="pool"),
     "MCBSTD3, MuJoCo": maker(MCBSTD3, "InvertedPendulum-v5"),
+    "MCBSTD3, rollout replay and value expansion": maker(
+        MCBSTD3, "InvertedPendulum-v5", n_envs=2, rollout_replay=0.25, value_expansion=2
+    ),
+    "MCBSTD3, saturation by episodes": maker(
+        MCBSTD3,
+        "InvertedPendulum-v5",
+        search_schedule="saturation",
+        search_unit="episode",
+        search_share=0.6,
+        saturation_window=20,
+    ),
+    "MCBSTD3, few directions": maker(MCBSTD3, "Hopper-v5", proposal_dims=2, noise_hold=2),
     "MCBSDDPG": maker(MCBSDDPG),
     "MCBSDDPG, refinement of a preset": maker(MCBSDDPG, preset="balanced"),
     "MCBSSAC, soft values": maker(MCBSSAC, entropy_bonus=True),
