@@ -26,7 +26,7 @@ from sb3_mcbs.models import EnsembleModel
 
 ARMS = {"none": None, "exact": "auto", "learned": "ensemble"}
 EVALUATION_SEED = 1000
-EPISODES = 3
+EPISODES = 10
 HORIZONS = (1, 2, 3, 5, 10)
 #: What RL Zoo's settings of TD3 for an environment are besides those for HalfCheetah.
 SETTINGS: dict[str, dict[str, Any]] = {
