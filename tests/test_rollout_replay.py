@@ -188,7 +188,7 @@ def test_normalised_and_dict_observations(make_agent, make_dict_env, cls):
     env = VecNormalize(DummyVecEnv([make_dict_env]))
     agent = make_agent(env, cls=cls, policy="MultiInputPolicy", rollout_replay=0.5)
     agent.learn(60)
-    store = agent._rollout_store()
+    store = agent._simulated_batches._rollout_replay()
     buffer = agent.replay_buffer
     last = buffer.rollout_observations["angle"][40, 0, 0]
     assert abs(np.linalg.norm(last) - 1) < 1e-5, "as the environment returns them, not normalised"
@@ -208,9 +208,13 @@ def test_rollouts_are_saved_with_the_replay_buffer(make_agent, tmp_path, cls):
     agent.save(tmp_path / "agent")
     agent.save_replay_buffer(tmp_path / "buffer")
     loaded = cls.load(tmp_path / "agent", env=snapshot_vec_env("Pendulum-v1"))
-    assert loaded.rollout_replay == 0.5 and loaded._rollout_store().count == 0
+    assert loaded.rollout_replay == 0.5 and loaded._simulated_batches._rollout_replay().count == 0
     loaded.load_replay_buffer(tmp_path / "buffer")
-    assert loaded._rollout_store().count == agent._rollout_store().count > 0
+    assert (
+        loaded._simulated_batches._rollout_replay().count
+        == agent._simulated_batches._rollout_replay().count
+        > 0
+    )
     for name in ("actions", "rewards", "lengths", "terminated", "observations"):
         np.testing.assert_array_equal(
             getattr(loaded.replay_buffer, f"rollout_{name}"), getattr(agent.replay_buffer, f"rollout_{name}")
@@ -232,7 +236,11 @@ def test_a_resumed_run_learns_from_the_same_rollouts(make_agent, tmp_path, cls, 
         return make_agent(make_env(folder), cls=cls, **settings)
 
     whole, resumed = assert_resumed_is_exact(make, tmp_path, 180, 130, make_env=make_env)
-    assert whole._rollout_store().count == resumed._rollout_store().count > 0
+    assert (
+        whole._simulated_batches._rollout_replay().count
+        == resumed._simulated_batches._rollout_replay().count
+        > 0
+    )
     assert whole.rollout_rng.bit_generator.state == resumed.rollout_rng.bit_generator.state
 
 

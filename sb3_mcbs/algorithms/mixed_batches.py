@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from operator import itemgetter
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -10,7 +11,56 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_mcbs.models.base import Observations
+from sb3_mcbs.search.interface import map_arrays
+
 Samples = ReplayBufferSamples | DictReplayBufferSamples
+
+
+class Outcome(NamedTuple):
+    """What transitions of several steps came to.
+
+    :param returns: ``[n]``, discounted sums of rewards as the networks are given them.
+    :param lengths: ``[n]``, steps.
+    :param terminated: ``[n]`` bool, whether the environment ended the episode.
+    :param observations: ``[n, *]``, the last ones, as replay buffers keep them.
+    """
+
+    returns: np.ndarray
+    lengths: np.ndarray
+    terminated: np.ndarray
+    observations: Observations
+
+
+def as_samples(
+    buffer: Any,
+    at: tuple[np.ndarray, ...],
+    actions: np.ndarray,
+    outcome: Outcome,
+    gamma: float,
+    env: VecNormalize | None,
+) -> Samples:
+    """Make a batch, as replay buffers do.
+
+    :param buffer: the replay buffer.
+    :param at: rows and environments ``[n]`` where the transitions begin.
+    :param actions: ``[n, act_dim]``, the first ones.
+    :param outcome: ``[n]``.
+    :param gamma: discount factor per step.
+    :param env: normalises observations.
+    :return: the batch, with discounts for the next observations' values.
+    """
+    first = buffer._normalize_obs(map_arrays(itemgetter(at), buffer.observations), env)
+    last = buffer._normalize_obs(outcome.observations, env)
+    samples = DictReplayBufferSamples if isinstance(first, dict) else ReplayBufferSamples
+    return samples(
+        map_arrays(buffer.to_torch, first),
+        buffer.to_torch(actions),
+        map_arrays(buffer.to_torch, last),
+        buffer.to_torch(outcome.terminated.astype(np.float32)[:, None]),
+        buffer.to_torch(outcome.returns.astype(np.float32)[:, None]),
+        buffer.to_torch((gamma**outcome.lengths).astype(np.float32)[:, None]),
+    )
 
 
 class Simulations(Protocol):

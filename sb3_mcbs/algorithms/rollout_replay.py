@@ -13,9 +13,9 @@ from typing import Any, cast
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_mcbs.algorithms.mixed_batches import Outcome, Samples, as_samples
 from sb3_mcbs.models.base import Observations
 from sb3_mcbs.search import Rollouts, SearchSettings
 from sb3_mcbs.search.checks import CheckedSettings
@@ -119,9 +119,7 @@ class RolloutReplay:
         buffer.rollout_lengths[at] = rollouts.lengths
         buffer.rollout_count += int(np.count_nonzero(rollouts.lengths))
 
-    def sample(
-        self, n: int, gamma: float, rng: np.random.Generator, env: VecNormalize | None
-    ) -> ReplayBufferSamples | DictReplayBufferSamples:
+    def sample(self, n: int, gamma: float, rng: np.random.Generator, env: VecNormalize | None) -> Samples:
         """Draw rollouts, each equally likely.
 
         :param n: how many.
@@ -136,19 +134,13 @@ class RolloutReplay:
         rewards = buffer._normalize_reward(buffer.rollout_rewards[places], env)
         steps = np.arange(rewards.shape[1])
         discounted = rewards * np.where(steps < lengths[:, None], gamma**steps, 0.0)
-        observations, last = (
-            buffer._normalize_obs(map_arrays(itemgetter(index), kept), env)
-            for kept, index in ((buffer.observations, at), (buffer.rollout_observations, places))
+        outcome = Outcome(
+            discounted.sum(axis=1),
+            lengths,
+            buffer.rollout_terminated[places],
+            map_arrays(itemgetter(places), buffer.rollout_observations),
         )
-        samples = DictReplayBufferSamples if isinstance(observations, dict) else ReplayBufferSamples
-        return samples(
-            map_arrays(buffer.to_torch, observations),
-            buffer.to_torch(buffer.rollout_actions[places]),
-            map_arrays(buffer.to_torch, last),
-            buffer.to_torch(buffer.rollout_terminated[places].astype(np.float32)[:, None]),
-            buffer.to_torch(discounted.sum(axis=1, dtype=np.float32)[:, None]),
-            buffer.to_torch((gamma**lengths).astype(np.float32)[:, None]),
-        )
+        return as_samples(buffer, at, buffer.rollout_actions[places], outcome, gamma, env)
 
     def _draw(self, n: int, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
         """Draw places that hold a rollout: rows, environments and numbers, each ``[n]``."""

@@ -12,10 +12,9 @@ from typing import Any, cast
 
 import numpy as np
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_mcbs.algorithms.mixed_batches import Samples
+from sb3_mcbs.algorithms.mixed_batches import Outcome, Samples, as_samples
 from sb3_mcbs.algorithms.networks import policy_function
 from sb3_mcbs.algorithms.searcher import Searcher
 from sb3_mcbs.models import ForwardModelError
@@ -127,31 +126,23 @@ class ValueExpansion:
         """
         buffer = self._buffer
         at = rng.integers(0, buffer.size(), n), rng.integers(0, buffer.n_envs, n)
-        rewards = np.array(buffer._normalize_reward(buffer.rewards[at], env), dtype=np.float64)
-        terminated = buffer.dones[at] * (1 - buffer.timeouts[at])
-        last = map_arrays(itemgetter(at), buffer.next_observations)
-        lengths = np.ones(n, dtype=int)
+        outcome = Outcome(
+            np.array(buffer._normalize_reward(buffer.rewards[at], env), dtype=np.float64),
+            np.ones(n, dtype=int),
+            (buffer.dones[at] * (1 - buffer.timeouts[at])).astype(bool),
+            map_arrays(itemgetter(at), buffer.next_observations),
+        )
         going = np.flatnonzero(buffer.expansion_held[at])
         if len(going):
             states = buffer.expansion_states[at[0][going], at[1][going]]
-            self._go_on(states, going, (rewards, terminated, last, lengths), gamma, rng, env)
-        samples = DictReplayBufferSamples if isinstance(last, dict) else ReplayBufferSamples
-        first = buffer._normalize_obs(map_arrays(itemgetter(at), buffer.observations), env)
-        last = buffer._normalize_obs(last, env)
-        return samples(
-            map_arrays(buffer.to_torch, first),
-            buffer.to_torch(buffer.actions[at]),
-            map_arrays(buffer.to_torch, last),
-            buffer.to_torch(terminated.astype(np.float32)[:, None]),
-            buffer.to_torch(rewards.astype(np.float32)[:, None]),
-            buffer.to_torch((gamma**lengths).astype(np.float32)[:, None]),
-        )
+            self._go_on(states, going, outcome, gamma, rng, env)
+        return as_samples(buffer, at, buffer.actions[at], outcome, gamma, env)
 
     def _go_on(
         self,
         states: np.ndarray,
         going: np.ndarray,
-        sums: tuple[np.ndarray, np.ndarray, Any, np.ndarray],
+        outcome: Outcome,
         gamma: float,
         rng: np.random.Generator,
         env: VecNormalize | None,
@@ -160,10 +151,9 @@ class ValueExpansion:
 
         :param states: ``[m, state_size]``.
         :param going: ``[m]``, whose states these are.
-        :param sums: returns ``[n]``, terminations ``[n]``, last observations ``[n, *]`` as buffers keep them
-            and lengths ``[n]`` of all transitions; changed.
+        :param outcome: of all transitions; changed.
         """
-        returns, terminated, last, lengths = sums
+        returns, lengths, terminated, last = outcome
         searcher, model, buffer = self._searcher, self._searcher.model, self._buffer
         assert model is not None
         model.set_roots(list(states), np.arange(len(going)), rng)
