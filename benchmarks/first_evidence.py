@@ -27,7 +27,10 @@ from sb3_mcbs.zoo.repeat import load_run
 from sb3_mcbs.zoo.report import ACTOR, SEARCH, load_policies
 
 SEARCH_SETTINGS = {"beam_width": 6, "rollout_depth": 3, "n_simulations": 5, "beam_noise": 0.1, "n_threads": 1}
-HYPERPARAMS = {"td3": f"search_evaluation:{SEARCH_SETTINGS}", "mcbs_td3": "n_threads:1"}
+HYPERPARAMS = {
+    "td3": [f"search_evaluation:{SEARCH_SETTINGS}"],
+    "mcbs_td3": ["preset:'paper'", "n_threads:1"],
+}
 LABELS = {"td3": "TD3", "mcbs_td3": "MCBS-TD3"}
 COLORS = {
     ("td3", ACTOR): "tab:blue",
@@ -57,7 +60,7 @@ def command(args: argparse.Namespace, algo: str, seed: int) -> list[str]:
         *(sys.executable, "-m", "rl_zoo3.train", "--algo", algo, "--env", args.env, "--seed", str(seed)),
         *("-conf", "sb3_mcbs", "-n", str(args.steps), "--eval-freq", str(args.eval_freq)),
         *("--eval-episodes", str(args.eval_episodes), "--num-threads", "1", "-f", args.log_folder),
-        *("-params", HYPERPARAMS[algo], *args.params),
+        *("-params", *HYPERPARAMS[algo], *args.params),
     ]
 
 

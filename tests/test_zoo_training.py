@@ -171,6 +171,19 @@ def test_a_preset_of_the_command_line_goes_before_the_file(
     assert (agent.preset, agent.search_settings) == ("strong", settings)
 
 
+@pytest.mark.parametrize("preset", ["paper", "strong"])
+def test_a_preset_replaces_what_the_file_says_of_the_search(
+    preset: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("-n", "101", "--eval-freq", "-1", "-params", *TINY, f"preset:'{preset}'", "n_threads:1")
+    zoo_train(monkeypatch, tmp_path, "mcbs_td3", *words, env="HalfCheetah-v5")
+    folder = tmp_path / "logs" / "mcbs_td3" / "HalfCheetah-v5_1"
+    agent = MCBSTD3.load(folder / "HalfCheetah-v5.zip")
+    assert agent.search_settings == SearchSettings.preset(preset, n_threads=1)
+    is_algorithm_1 = (agent.search_share, agent.search_unit, agent.value_expansion) == (1, "step", 0)
+    assert is_algorithm_1 == (preset == "paper"), "the others leave it to the file when to search"
+
+
 def test_several_environments_in_this_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     zoo_train(monkeypatch, tmp_path, "mcbs_td3", "-n", "240", "--eval-freq", "200", "--eval-episodes", "1",
               "-params", *TINY_SEARCH, "n_envs:4")  # fmt: skip

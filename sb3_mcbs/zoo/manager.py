@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,11 +13,13 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_mcbs.algorithms.rollout_replay import RolloutReplaySettings
+from sb3_mcbs.algorithms.value_expansion import ValueExpansionSettings
 from sb3_mcbs.checkpoints import CheckpointError, ExactCheckpointCallback
 from sb3_mcbs.checkpoints.resume import continue_with
 from sb3_mcbs.checkpoints.resumption import Resumption
 from sb3_mcbs.models import ForwardModelError
-from sb3_mcbs.search import SearchSettings, with_preset
+from sb3_mcbs.search import ScheduleSettings, SearchSettings, with_preset
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 from sb3_mcbs.zoo.callbacks import SearchEvalCallback, SecondEvalCallback
 from sb3_mcbs.zoo.paths import hyperparams_path, sibling_folder
@@ -26,6 +29,8 @@ from sb3_mcbs.zoo.registration import ALGORITHMS
 PACKAGE_CONFIG = "sb3_mcbs"
 #: Agents with a policy and critics that a search can be put on.
 SEARCHABLE = ("ddpg", "sac", "td3", "tqc")
+#: Settings that no preset is about.
+OF_THE_MACHINE = ("n_threads", "forward_model", "matmul_precision")
 #: The folder of exact checkpoints within a run's folder.
 CHECKPOINTS = "checkpoints"
 
@@ -107,7 +112,7 @@ class MCBSExperimentManager(ExperimentManager):
                 raise ValueError(
                     "Trials draw the search's settings and know no preset: leave preset out of -params."
                 )
-            self.custom_hyperparams = with_preset(custom["preset"], custom)
+            self.custom_hyperparams = {**_settings_of_preset(custom["preset"]), **custom}
         return super().read_hyperparameters()
 
     def _preprocess_hyperparams(
@@ -168,6 +173,22 @@ class MCBSExperimentManager(ExperimentManager):
             return self.create_envs(self.n_eval_envs, eval_env=True)
         finally:
             self.env_wrapper = wrapper
+
+
+def _settings_of_preset(name: str) -> dict[str, Any]:
+    """
+    What a preset of the command line replaces in a hyperparameter file.
+
+    :param name: of the preset
+    :return: every setting of how is searched; for "paper", which is Algorithm 1 at every step, also those of
+        when is searched and what is learned from simulations
+    """
+    preset = asdict(SearchSettings.preset(name))
+    settings = {name: value for name, value in preset.items() if name not in OF_THE_MACHINE}
+    if name == "paper":
+        for defaults in (ScheduleSettings(), RolloutReplaySettings(), ValueExpansionSettings()):
+            settings |= asdict(defaults)
+    return settings
 
 
 def _checked_search_evaluation(settings: Any, algo: str) -> dict[str, Any]:
