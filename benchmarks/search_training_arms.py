@@ -29,6 +29,7 @@ ON_TOP: dict[str, Any] = {"action_noise_after_search": True}
 
 ARMS: dict[str, tuple[type[TD3], dict[str, Any]]] = {
     "td3": (PlainTD3, {}),
+    "td3_sb3": (TD3, {}),
     "td3_n3": (PlainTD3, {"n_steps": 3}),
     "algorithm1": (MCBSTD3, ALGORITHM_1),
     "efficient": (MCBSTD3, EFFICIENT),

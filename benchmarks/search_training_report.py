@@ -115,7 +115,7 @@ def draw(env_id: str, runs: list[Run], arms: list[str], path: Path) -> None:
             axes.plot(steps, middle, color=f"C{number}", linewidth=2, label=label)
         axes.set(title=f"{env_id}, {name}", xlabel="environment steps")
     both_axes[0].set_ylabel("return (thick: interquartile mean)")
-    both_axes[0].legend()
+    both_axes[0].legend(loc="upper left")
     figure.tight_layout()
     figure.savefig(path, dpi=100)
     print(f"Written: {path}")
