@@ -175,7 +175,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
         of_agent = [row for row in rows if row["agent"] == agent]
         actor = [np.mean(row["returns"]) for row in of_agent if row["arm"] == "actor alone"][-1]
         panel.axhline(actor, color="grey", linestyle=":", label="actor alone")
-        for strategy, marker in (("beam", "o"), ("tree", "^"), ("refine", "s")):
+        for strategy, marker, color in (("beam", "o", "C0"), ("tree", "^", "C1"), ("refine", "s", "C2")):
             for seeds, filled in (("choosing", False), ("reporting", True)):
                 points = [
                     (row["simulated steps"], np.mean(row["returns"]))
@@ -186,8 +186,10 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
                 ]
                 if points:
                     name = f"{strategy}, {seeds} seeds"
-                    face = None if filled else "none"
-                    panel.plot(*zip(*points, strict=True), marker, label=name, markerfacecolor=face)
+                    face = color if filled else "none"
+                    panel.plot(
+                        *zip(*points, strict=True), marker, label=name, color=color, markerfacecolor=face
+                    )
         panel.set(xscale="log", xlabel="simulated steps per decision", ylabel="return", title=agent)
         panel.set_xticks(BUDGETS, [str(budget) for budget in BUDGETS])
         panel.minorticks_off()
