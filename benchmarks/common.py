@@ -82,6 +82,16 @@ def _shown(value: Any) -> str:
     return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
 
 
+def read(name: str) -> list[dict[str, Any]]:
+    """Read rows that :func:`write` wrote.
+
+    :param name: of the file, without its ending.
+    :return: the rows; none if there is no such file.
+    """
+    path = RESULTS / f"{name}.json"
+    return json.loads(path.read_text())["results"] if path.exists() else []
+
+
 def write(name: str, results: Any) -> Path:
     """Write results with the machine's description.
 

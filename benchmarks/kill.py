@@ -5,7 +5,6 @@ Every second SIGKILL hits while a checkpoint is being written, the others at ran
 
 import argparse
 import itertools
-import json
 import os
 import signal
 import subprocess
@@ -17,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.common import RESULTS, print_table, write
+from benchmarks.common import print_table, read, write
 from benchmarks.kill_run import ALGORITHMS, CASES, RESULT, STARTED
 
 STEPS = {"HalfCheetah-v5": 4000, "Ant-v5": 3000, "Walker2d-v5": 6000, "Pendulum-v1": 5000}
@@ -170,10 +169,8 @@ def main() -> None:
 
 def _others(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """What was measured before of other algorithms and environments."""
-    path = RESULTS / "kill.json"
-    before = json.loads(path.read_text())["results"] if path.exists() else []
     known = {(row["algorithm"], row["environment"]) for row in rows}
-    return [row for row in before if (row["algorithm"], row["environment"]) not in known]
+    return [row for row in read("kill") if (row["algorithm"], row["environment"]) not in known]
 
 
 if __name__ == "__main__":

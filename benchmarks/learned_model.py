@@ -21,7 +21,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 
 from benchmarks.common import NETWORKS, write
 from benchmarks.search_training_arms import PlainTD3
-from sb3_mcbs import MCBSTD3, SearchPolicy, SearchSettings, SnapshotEnvWrapper
+from sb3_mcbs import MCBSTD3, SearchPolicy, SnapshotEnvWrapper
 from sb3_mcbs.models import EnsembleModel
 
 ARMS = {"none": None, "exact": "auto", "learned": "ensemble"}
@@ -52,9 +52,7 @@ def make_agent(args: argparse.Namespace) -> Any:
     }
     if ARMS[args.arm] is None:
         return PlainTD3("MlpPolicy", env, **settings)
-    search = SearchSettings.preset("efficient", n_threads=1, forward_model=ARMS[args.arm])
-    names = SearchSettings.names()
-    settings |= {name: getattr(search, name) for name in names}
+    settings |= {"preset": "efficient", "n_threads": 1, "forward_model": ARMS[args.arm]}
     if args.arm == "learned":
         settings |= {"ensemble_max_error": args.max_error, "ensemble_pessimism": args.pessimism}
     return MCBSTD3("MlpPolicy", env, **settings)
@@ -71,9 +69,9 @@ def evaluate(agent: Any, env_id: str, models: list[str]) -> dict[str, list[float
     env = make_vec_env(env_id, EPISODES)
     policies: dict[str, Any] = {"actor": agent}
     for model in models:
-        search = SearchSettings.preset("efficient", n_threads=1, forward_model=model)
-        settings = {name: getattr(search, name) for name in SearchSettings.names()}
-        policies[f"search, {model}"] = SearchPolicy(agent, env, seed=EVALUATION_SEED, **settings)
+        policies[f"search, {model}"] = SearchPolicy(
+            agent, env, seed=EVALUATION_SEED, preset="efficient", n_threads=1, forward_model=model
+        )
     returns: dict[str, Any] = {}
     for name, policy in policies.items():
         env.seed(EVALUATION_SEED)

@@ -79,8 +79,7 @@ class Evaluation(BaseCallback):
                 "step": self.num_timesteps,
                 "training": float(np.mean(self._returns[-10:])),
                 **returns,
-                "simulated_steps": getattr(agent, "n_simulated_steps", 0)
-                + getattr(agent, "n_learning_steps", 0),
+                "simulated_steps": getattr(agent, "n_simulated_steps", 0),
                 "training_seconds": now - self._start - self._evaluating,
             }
         )

@@ -5,12 +5,11 @@ from typing import Any
 import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_mcbs import MCBSTD3
-from sb3_mcbs.algorithms.td3_update import FastUpdate, TD3Update, _adam_step
+from sb3_mcbs.algorithms.td3_update import FastUpdate, TD3Update
 from sb3_mcbs.search import search
 from sb3_mcbs.search.strategies import Decision
 
@@ -61,7 +60,6 @@ class PlanningTD3(MCBSTD3):
         **kwargs: Any,
     ) -> None:
         self.imitation, self.replan = imitation, replan
-        self.n_learning_steps = 0
         super().__init__(*args, **{"replay_buffer_class": RowsReplayBuffer, **kwargs})
 
     def _make_update(self) -> TD3Update:
@@ -120,31 +118,21 @@ class PlanningUpdate(TD3Update):
             agent.search_rng,
         )
         result = search(decision)
-        agent.n_learning_steps += result.simulated_steps
+        agent.n_simulated_steps += result.simulated_steps
         buffer.plans[rows] = result.actions
 
-    def _update_actor(self, pairs: th.Tensor) -> float:
-        """One step of the actor up the first critic, held towards searched actions.
+    def _action_gradient(self, pairs: th.Tensor, n_obs: int) -> tuple[th.Tensor, th.Tensor]:
+        """As TD3's, with actions held towards searched ones.
 
-        :param pairs: ``[obs_dim + act_dim, batch]``; its actions are overwritten.
-        :return: the loss without the constraint.
+        :param pairs: ``[obs_dim + act_dim, batch]``, with the actor's actions.
+        :param n_obs: obs_dim.
+        :return: the first critic's values, and the gradient.
         """
+        values, gradient = super()._action_gradient(pairs, n_obs)
         if not self._agent.imitation:
-            return super()._update_actor(pairs)
-        first_critic = self._critics[0]
-        n_obs = len(pairs) - get_action_dim(self._agent.action_space)
-        observations = pairs[:n_obs]
-        actor_outputs = self._actor.outputs(observations)
-        pairs[n_obs:] = actor_outputs[-1]
-        outputs = first_critic.outputs(pairs)
-        values = outputs[-1]
-        gradient = th.full_like(values, -1 / values.numel())
-        gradient = first_critic.backward(pairs, outputs, gradient, of_parameters=False)[n_obs:]
+            return values, gradient
         rows = self._buffer.rows
         is_planned = th.as_tensor(self._buffer.is_planned[rows], dtype=th.float32)
-        away = actor_outputs[-1] - th.as_tensor(self._buffer.plans[rows]).t()
+        away = pairs[n_obs:] - th.as_tensor(self._buffer.plans[rows]).t()
         weight = self._agent.imitation * values.abs().mean() / values.numel()
-        gradient = gradient + 2 * weight * is_planned * away
-        self._actor.backward(observations, actor_outputs, gradient, of_parameters=True)
-        _adam_step(self._agent.actor.optimizer)
-        return float(-values.mean())
+        return values, gradient + 2 * weight * is_planned * away

@@ -14,7 +14,6 @@ entropy_bonus, "truncated" tqc_value. Arms that the file of results holds alread
 """
 
 import argparse
-import json
 import time
 from pathlib import Path
 from typing import Any
@@ -26,7 +25,7 @@ from matplotlib.figure import Figure
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from benchmarks.common import RESULTS, print_table, write
+from benchmarks.common import RESULTS, print_table, read, write
 from benchmarks.strategies_arms import ARMS, BUDGETS, SLACK, has_value
 from sb3_mcbs import SearchPolicy, SearchSettings, SnapshotEnvWrapper, load_agent
 from sb3_mcbs.search import PRESETS
@@ -140,12 +139,6 @@ def by_cost(arms: list[str]) -> list[str]:
     return sorted(arms, key=lambda arm: SearchSettings(**ARMS[arm]).simulated_steps())
 
 
-def measured() -> list[dict[str, Any]]:
-    """The rows that the file of results holds."""
-    path = RESULTS / f"{FILE}.json"
-    return json.loads(path.read_text())["results"] if path.exists() else []
-
-
 def show(rows: list[dict[str, Any]]) -> None:
     """Print a table for every agent and set of seeds."""
     header = ["", "return", "least", "most", "simulated steps", "critic evaluations", "cpu ms",
@@ -209,12 +202,12 @@ def main() -> None:
     parser.add_argument("--table", action="store_true", help="only show what was measured, and draw it")
     arguments = parser.parse_args()
     if arguments.table:
-        show(measured())
-        draw(measured(), FIGURE)
+        show(read(FILE))
+        draw(read(FILE), FIGURE)
         return
     th.set_num_threads(1)
     agent = load_agent(arguments.agent, make_vec_env(arguments.env, 1), device="cpu")
-    arms = by_cost(list(ARMS) if arguments.seeds == "choosing" else reported_arms(measured()))
+    arms = by_cost(list(ARMS) if arguments.seeds == "choosing" else reported_arms(read(FILE)))
     for arm in arguments.arms or arms:
         of = {
             "agent": arguments.agent.stem,
@@ -222,14 +215,14 @@ def main() -> None:
             "seeds": arguments.seeds,
             "arm": arm,
         }
-        rows, settings = measured(), ARMS[arm]
+        rows, settings = read(FILE), ARMS[arm]
         # Others may have added arms meanwhile, so the file is read again.
         done = any(of.items() <= row.items() and row["settings"] == settings for row in rows)
         costly = SearchSettings(**settings).simulated_steps() > arguments.most
         if done or costly or not has_value(agent, settings):
             continue
         result = run_arm(agent, arguments.env, SEEDS[arguments.seeds], settings)
-        write(FILE, [*measured(), {**of, "settings": settings, **result}])
+        write(FILE, [*read(FILE), {**of, "settings": settings, **result}])
         print(arm, f"{np.mean(result['returns']):.0f}", f"{result['simulated steps']:.0f}", flush=True)
 
 

@@ -14,14 +14,7 @@ from sb3_mcbs.algorithms.vec_env_view import AgentView, reward_normalizer
 from sb3_mcbs.models.base import Observations
 from sb3_mcbs.models.ensemble import Transitions
 from sb3_mcbs.models.ensemble_model import EnsembleModel
-from sb3_mcbs.search import (
-    Moment,
-    PlanMemory,
-    RecentActions,
-    SearchResult,
-    SearchSettings,
-    check_dynamics,
-)
+from sb3_mcbs.search import Moment, RecentActions, SearchResult, SearchSettings
 from sb3_mcbs.search.interface import take_rows
 
 logger = logging.getLogger("sb3_mcbs")
@@ -76,9 +69,6 @@ class LearnedSearcher(Searcher):
         self._originals: Any = None
         self._n_searches = 0
         self._said_not_ready = False
-        check_dynamics(self.settings, self.model.deterministic)
-        if self.settings.strategy == "refine":
-            self._plans = PlanMemory(vec_env.num_envs, self.settings.horizon, self._act_dim)
 
     @property
     def _learned_model(self) -> LearnedModel:

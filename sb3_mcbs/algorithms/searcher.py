@@ -93,6 +93,10 @@ class Searcher:
         self.view: AgentView
         if settings.rollout_depth > 0:
             self._connect(vec_env, normalize_reward)
+            assert self.model is not None
+            check_dynamics(settings, self.model.deterministic)
+            if settings.strategy == "refine":
+                self._plans = PlanMemory(len(self._all_envs), settings.horizon, self._act_dim)
         self._functions = self._agent_functions()
 
     def _connect(self, vec_env: VecEnv, normalize_reward: bool | None) -> None:
@@ -103,9 +107,6 @@ class Searcher:
         self.environments: Environments = snapshot_environments(view.base)
         self._all_envs = range(len(self.environments))
         self.model = make_forward_model(self.environments, settings.forward_model, settings.n_threads)
-        check_dynamics(settings, self.model.deterministic)
-        if settings.strategy == "refine":
-            self._plans = PlanMemory(len(self.environments), settings.horizon, self._act_dim)
 
     @property
     def ready(self) -> bool:

@@ -24,11 +24,12 @@ class SimulatedBatches:
     def __init__(self, agent: Any) -> None:
         self._agent = agent
         RolloutReplaySettings.of(agent).check_search(agent.search_settings)
-        ValueExpansionSettings.of(agent).check_search(
-            agent.search_settings, agent.rollout_replay, agent.replay_buffer
-        )
+        expansion = ValueExpansionSettings.of(agent)
+        expansion.check_search(agent.search_settings, agent.rollout_replay)
+        expansion.check_buffer(agent.replay_buffer)
         self._expansion: ValueExpansion | None = None
         self._expansion_of: tuple[Any, Any] | None = None
+        self._most_rollouts = agent.schedule_settings.most_rollouts(agent.search_settings)
         self._rollout_replay()  # makes room in the buffer
 
     def connect(self) -> None:
@@ -36,6 +37,7 @@ class SimulatedBatches:
 
         :raises ForwardModelError: if its forward model is not one to learn from.
         """
+        self._most_rollouts = self._agent.schedule_settings.most_rollouts(self._agent.search_settings)
         self._value_expansion()
 
     def store(self, row: int, rollouts: Rollouts | None, dones: np.ndarray) -> None:
@@ -65,8 +67,7 @@ class SimulatedBatches:
         agent = self._agent
         if not agent.rollout_replay:
             return None
-        size = agent.schedule_settings.most_rollouts(agent.search_settings)
-        return RolloutReplay(agent.replay_buffer, *size)
+        return RolloutReplay(agent.replay_buffer, *self._most_rollouts)
 
     def _value_expansion(self) -> ValueExpansion | None:
         agent = self._agent

@@ -117,18 +117,27 @@ class TD3Update:
         :param pairs: ``[obs_dim + act_dim, batch]``; its actions are overwritten.
         :return: the loss: the negative mean of the critic's values.
         """
-        first_critic = self._critics[0]
         n_obs = len(pairs) - get_action_dim(self._agent.action_space)
         observations = pairs[:n_obs]
         actor_outputs = self._actor.outputs(observations)
         pairs[n_obs:] = actor_outputs[-1]
-        outputs = first_critic.outputs(pairs)
-        values = outputs[-1]
-        gradient = th.full_like(values, -1 / values.numel())
-        gradient = first_critic.backward(pairs, outputs, gradient, of_parameters=False)[n_obs:]
+        values, gradient = self._action_gradient(pairs, n_obs)
         self._actor.backward(observations, actor_outputs, gradient, of_parameters=True)
         _adam_step(self._agent.actor.optimizer)
         return float(-values.mean())
+
+    def _action_gradient(self, pairs: th.Tensor, n_obs: int) -> tuple[th.Tensor, th.Tensor]:
+        """How the actor's loss changes with its actions.
+
+        :param pairs: ``[obs_dim + act_dim, batch]``, with the actor's actions.
+        :param n_obs: obs_dim.
+        :return: the first critic's values ``[1, batch]``, and the gradient ``[act_dim, batch]``.
+        """
+        first_critic = self._critics[0]
+        outputs = first_critic.outputs(pairs)
+        values = outputs[-1]
+        gradient = th.full_like(values, -1 / values.numel())
+        return values, first_critic.backward(pairs, outputs, gradient, of_parameters=False)[n_obs:]
 
     def _update_target_networks(self) -> None:
         for targets, networks in self._targets_and_networks:

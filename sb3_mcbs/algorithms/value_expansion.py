@@ -47,12 +47,11 @@ class ValueExpansionSettings(CheckedSettings):
         if self.value_expansion and not self.expanded_share:
             raise ValueError("value_expansion needs an expanded_share above 0: nothing would be expanded.")
 
-    def check_search(self, settings: SearchSettings, rollout_replay: float, buffer: ReplayBuffer) -> None:
+    def check_search(self, settings: SearchSettings, rollout_replay: float) -> None:
         """Refuse what does not go together.
 
         :param settings: of the search.
         :param rollout_replay: share of every batch that is taken from rollouts.
-        :param buffer: the replay buffer.
         :raises ValueError: says which setting, and why.
         """
         if not self.value_expansion:
@@ -67,7 +66,14 @@ class ValueExpansionSettings(CheckedSettings):
                 "rollout_replay and expanded_share are parts of the same batch and must not exceed 1 "
                 f"together; got {rollout_replay} and {self.expanded_share}."
             )
-        if buffer.optimize_memory_usage:
+
+    def check_buffer(self, buffer: ReplayBuffer) -> None:
+        """Refuse replay buffers that do not keep what is needed.
+
+        :param buffer: the replay buffer.
+        :raises ValueError: says which setting, and why.
+        """
+        if self.value_expansion and buffer.optimize_memory_usage:
             raise ValueError(
                 "value_expansion goes on from the last observation of a transition, which a replay buffer "
                 "with optimize_memory_usage does not keep at the end of an episode: leave that out."

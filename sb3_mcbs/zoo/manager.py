@@ -183,8 +183,9 @@ def _settings_of_preset(name: str) -> dict[str, Any]:
     :return: every setting of how is searched; for "paper", which is Algorithm 1 at every step, also those of
         when is searched and what is learned from simulations
     """
-    preset = asdict(SearchSettings.preset(name))
-    settings = {name: value for name, value in preset.items() if name not in OF_THE_MACHINE}
+    settings = asdict(SearchSettings.preset(name))
+    for setting in OF_THE_MACHINE:
+        del settings[setting]
     if name == "paper":
         for defaults in (ScheduleSettings(), RolloutReplaySettings(), ValueExpansionSettings()):
             settings |= asdict(defaults)

@@ -4,8 +4,8 @@ What ``-optimize`` draws for our algorithms, and how a trial's parameters become
 By default only the size and noise of the search are tuned and the other settings of the hyperparameter file
 are held, so that trials differ in one thing. ``SB3_MCBS_TUNE=strategies`` tunes how it searches as well,
 ``SB3_MCBS_TUNE=schedules`` when it searches and what is learned from it, ``SB3_MCBS_TUNE=all`` what RL Zoo
-tunes of the algorithm without search. Trials know no ``preset``: one in
-the hyperparameter file would change what a trial does not draw.
+tunes of the algorithm without search. Trials know no ``preset``: one in the hyperparameter file would change
+what a trial does not draw.
 """
 
 import os
@@ -15,6 +15,7 @@ import optuna
 
 from sb3_mcbs.algorithms.keywords import SETTINGS
 from sb3_mcbs.algorithms.rollout_replay import RolloutReplaySettings
+from sb3_mcbs.algorithms.value_expansion import ValueExpansionSettings
 from sb3_mcbs.search import ScheduleSettings, SearchSettings
 from sb3_mcbs.search.checks import CheckedSettings
 from sb3_mcbs.search.schedule import SCHEDULES, UNITS
@@ -160,11 +161,12 @@ def _why_senseless(params: dict[str, Any], sampled: dict[str, Any], n_actions: i
     try:
         settings = SearchSettings(**_of(params, SearchSettings))
         ScheduleSettings(**_of(params, ScheduleSettings)).check_search(settings)
-        RolloutReplaySettings(**_of(params, RolloutReplaySettings)).check_search(settings)
+        replay = RolloutReplaySettings(**_of(params, RolloutReplaySettings))
+        replay.check_search(settings)
+        expansion = ValueExpansionSettings(**_of(params, ValueExpansionSettings))
+        expansion.check_search(settings, replay.rollout_replay)
     except ValueError as error:
         return str(error)
-    if params.get("value_expansion") and settings.rollout_depth == 0:
-        return "value_expansion needs a rollout_depth of 1 or more"
     if settings.simulated_steps(deterministic=False) > MAX_SIMULATED_STEPS:
         return f"a decision would simulate more than {MAX_SIMULATED_STEPS} steps"
     return None
