@@ -59,6 +59,21 @@ ALGORITHMS: dict[str, tuple[type[OffPolicyAlgorithm], dict[str, Any]]] = {
             "rollout_replay": 0.25,
         },
     ),
+    "mcbs_td3 with expanded targets": (
+        MCBSTD3,
+        {
+            "n_threads": 1,
+            "preset": "efficient",
+            "search_unit": "episode",
+            "search_share": 0.5,
+            "value_expansion": 2,
+        },
+    ),
+    # An error that it is allowed from the first fit, so that the searches use it.
+    "mcbs_td3 with a learned model": (
+        MCBSTD3,
+        {"n_threads": 1, "preset": "efficient", "forward_model": "ensemble", "ensemble_max_error": 10.0},
+    ),
     "td3": (TD3, {}),
     "sac": (SAC, {}),
     "td3_one_rollout": (TD3, {"train_freq": 1_000_000}),

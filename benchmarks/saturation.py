@@ -1,7 +1,7 @@
 """The saturation schedule against searching at every step: final returns and simulated steps.
 
-Each seed is trained once with every schedule; both policies of each are evaluated on the same resets, and
-results are written after every run.
+Each seed is trained once with every schedule; both policies of each are evaluated on the same resets.
+Results are written after every seed, beside those of seeds that are known already.
 
     python -m benchmarks.saturation Pendulum-v1
     python -m benchmarks.saturation InvertedDoublePendulum-v5
@@ -17,7 +17,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.noise import NormalActionNoise
 
-from benchmarks.common import print_table, write
+from benchmarks.common import print_table, read, write
 from sb3_mcbs import MCBSTD3, SearchPolicy, SnapshotEnvWrapper
 from sb3_mcbs.search import PRESETS
 
@@ -28,7 +28,7 @@ SCHEDULES: dict[str, dict[str, Any]] = {
     "saturation": {"search_schedule": "saturation", "final_search_share": 0.1},
 }
 #: Environment steps, and what they are averaged over; both returns are flat long before the end.
-LENGTHS = {"Pendulum-v1": (20_000, 2_000), "InvertedDoublePendulum-v5": (40_000, 2_500)}
+LENGTHS = {"Pendulum-v1": (25_000, 2_000), "InvertedDoublePendulum-v5": (50_000, 2_500)}
 EPISODES = 20
 
 
@@ -84,12 +84,13 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=list(range(5)))
     args = parser.parse_args()
     th.set_num_threads(1)
-    rows = []
+    file, (steps, _) = f"saturation-{args.env}", LENGTHS[args.env]
+    rows = [row for row in read(file) if row["environment steps"] == steps]
     for seed in args.seeds:
-        for schedule in SCHEDULES:
-            rows.append(train(args.env, schedule, seed))
-            print(rows[-1], flush=True)
-        write(f"saturation-{args.env}", rows)
+        found = [train(args.env, schedule, seed) for schedule in SCHEDULES]
+        print(*found, sep="\n", flush=True)
+        rows = [row for row in rows if row["seed"] != seed] + found
+        write(file, rows)
     table = []
     for schedule in SCHEDULES:
         mine = [row for row in rows if row["schedule"] == schedule]

@@ -17,6 +17,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_mcbs.algorithms.mixed_batches import Outcome, Samples, as_samples
 from sb3_mcbs.algorithms.networks import policy_function
 from sb3_mcbs.algorithms.searcher import Searcher
+from sb3_mcbs.algorithms.torch_settings import one_thread
 from sb3_mcbs.models import ForwardModelError
 from sb3_mcbs.search import SearchSettings
 from sb3_mcbs.search.checks import CheckedSettings
@@ -141,7 +142,8 @@ class ValueExpansion:
         going = np.flatnonzero(buffer.expansion_held[at])
         if len(going):
             states = buffer.expansion_states[at[0][going], at[1][going]]
-            self._go_on(states, going, outcome, gamma, rng, env)
+            with one_thread():
+                self._go_on(states, going, outcome, gamma, rng, env)
         return as_samples(buffer, at, buffer.actions[at], outcome, gamma, env)
 
     def _go_on(
