@@ -1,6 +1,6 @@
 """Agents that are tried in ``benchmarks.search_training`` and are not part of the package."""
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch as th
@@ -90,8 +90,8 @@ class PlanningUpdate(TD3Update):
 
     @property
     def _buffer(self) -> RowsReplayBuffer:
-        assert isinstance(self._agent.replay_buffer, RowsReplayBuffer)
-        return self._agent.replay_buffer
+        # With a part of the batches from simulations there is something that passes itself off as the buffer.
+        return cast(RowsReplayBuffer, self._agent.replay_buffer)
 
     def _targets(self, data: ReplayBufferSamples) -> th.Tensor:
         targets = super()._targets(data)
@@ -131,8 +131,9 @@ class PlanningUpdate(TD3Update):
         values, gradient = super()._action_gradient(pairs, n_obs)
         if not self._agent.imitation:
             return values, gradient
-        rows = self._buffer.rows
+        rows = self._buffer.rows  # the first of the batch; what comes from simulations is behind them
         is_planned = th.as_tensor(self._buffer.is_planned[rows], dtype=th.float32)
-        away = pairs[n_obs:] - th.as_tensor(self._buffer.plans[rows]).t()
+        away = pairs[n_obs:, : len(rows)] - th.as_tensor(self._buffer.plans[rows]).t()
         weight = self._agent.imitation * values.abs().mean() / values.numel()
-        return values, gradient + 2 * weight * is_planned * away
+        gradient[:, : len(rows)] += 2 * weight * is_planned * away
+        return values, gradient

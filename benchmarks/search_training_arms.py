@@ -49,5 +49,9 @@ ARMS: dict[str, tuple[type[TD3], dict[str, Any]]] = {
     "half_imitation": (PlanningTD3, EFFICIENT | HALF | {"imitation": 0.1, "replan": True}),
     "half_expansion": (MCBSTD3, EFFICIENT | HALF | EXPANSION),
     "expansion": (MCBSTD3, EFFICIENT | EXPANSION | {"search_share": 0.0}),
+    "half_expansion_imitation": (
+        PlanningTD3,
+        EFFICIENT | HALF | EXPANSION | {"imitation": 0.1, "replan": True},
+    ),
     "efficient_expansion": (MCBSTD3, EFFICIENT | EXPANSION),
 }
