@@ -4,7 +4,7 @@ import logging
 import math
 import traceback
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -22,6 +22,7 @@ from stable_baselines3.common.vec_env import (
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn, VecEnvWrapper
 from stable_baselines3.her import HerReplayBuffer
 
+from sb3_mcbs.models.base import Observations
 from sb3_mcbs.models.workers import await_answers, worker_error
 from sb3_mcbs.snapshot import SIMULATION_DIVERGED
 
@@ -136,6 +137,33 @@ def check_observations(observations: Any) -> None:
             "what its reset, or its last step, computes there "
             "(stable_baselines3.common.env_checker.check_env helps)."
         )
+
+
+def check_networks(
+    policy: Callable[[Observations], np.ndarray],
+    value: Callable[[Observations, np.ndarray], np.ndarray],
+    observations: Observations,
+) -> None:
+    """Tell networks that diverged from rollouts that did.
+
+    :param policy: the actor.
+    :param value: the critics.
+    :param observations: ``[n_envs, *]``, present observations.
+    :raises NonFiniteError: if it is the networks, or the environments.
+    """
+    check_observations(observations)
+    actions = policy(observations)
+    if not is_finite(actions):
+        answer = "The actor answers"
+    elif not is_finite(value(observations, actions)):
+        answer = "The critics answer"
+    else:
+        return
+    raise NonFiniteError(
+        f"{answer} the present observations with NaN or infinity: the networks have diverged, and no action "
+        "can be chosen. Go back to an agent that was saved earlier, and train with a lower "
+        "learning_rate, or with rewards and observations on a smaller scale (VecNormalize)."
+    )
 
 
 def is_finite(values: np.ndarray) -> bool:

@@ -2,7 +2,7 @@
 
 import logging
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_mcbs.algorithms.faults import NonFiniteError, check_observations, is_finite
+from sb3_mcbs.algorithms.faults import check_networks, check_observations, is_finite
 from sb3_mcbs.algorithms.networks import (
     check_agent,
     check_values,
@@ -167,7 +167,7 @@ class Searcher:
                     self.model, roots, observations, agent, settings, deadline, self._pace, rng, directions
                 )
         if result.invalid_rollouts or not is_finite(result.actions):
-            _check_networks(agent.policy, agent.value, observations)
+            check_networks(agent.policy, agent.value, observations)
         return self._as_replay_buffers_keep_them(result) if record else result
 
     def check_networks(self, observations: Observations) -> None:
@@ -176,7 +176,7 @@ class Searcher:
         :param observations: ``[n_envs, *]``, as the agent got them.
         :raises NonFiniteError: if it is the networks, or the observations, that are not finite.
         """
-        _check_networks(policy_function(self.agent), value_function(self.agent), observations)
+        check_networks(policy_function(self.agent), value_function(self.agent), observations)
 
     def _as_replay_buffers_keep_them(self, result: SearchResult) -> SearchResult:
         assert result.rollouts is not None
@@ -379,33 +379,6 @@ class Searcher:
     def _warn(message: str) -> None:
         logger.warning(message)
         warnings.warn(message, stacklevel=4)
-
-
-def _check_networks(
-    policy: Callable[[Observations], np.ndarray],
-    value: Callable[[Observations, np.ndarray], np.ndarray],
-    observations: Observations,
-) -> None:
-    """Tell networks that diverged from rollouts that did.
-
-    :param policy: the actor.
-    :param value: the critics.
-    :param observations: ``[n_envs, *]``, present observations.
-    :raises NonFiniteError: if it is the networks, or the environments.
-    """
-    check_observations(observations)
-    actions = policy(observations)
-    if not is_finite(actions):
-        answer = "The actor answers"
-    elif not is_finite(value(observations, actions)):
-        answer = "The critics answer"
-    else:
-        return
-    raise NonFiniteError(
-        f"{answer} the present observations with NaN or infinity: the networks have diverged, and no action "
-        "can be chosen. Go back to an agent that was saved earlier, and train with a lower "
-        "learning_rate, or with rewards and observations on a smaller scale (VecNormalize)."
-    )
 
 
 def _last_observation(env: SnapshotEnvWrapper) -> Any:
