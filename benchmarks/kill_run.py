@@ -178,7 +178,8 @@ def ending(agent: OffPolicyAlgorithm, folder: Path) -> dict[str, np.ndarray]:
 
     :param agent: the agent.
     :param folder: of the run.
-    :return: digests of all parameters, optimizers and the replay buffer, episode returns and evaluations.
+    :return: digests of all parameters, optimizers, learned model and replay buffer, episode returns and
+        evaluations.
     """
     result = {f"parameter {name}": _digest(value) for name, value in agent.policy.state_dict().items()}
     for part in ("actor", "critic"):
@@ -186,6 +187,10 @@ def ending(agent: OffPolicyAlgorithm, folder: Path) -> dict[str, np.ndarray]:
             result |= {f"{part} optimizer {index} {name}": _digest(value) for name, value in state.items()}
     if isinstance(agent, SAC | TQC) and agent.log_ent_coef is not None:
         result["logarithm of the entropy coefficient"] = _digest(agent.log_ent_coef.detach())
+    if getattr(agent, "learned_model", None) is not None:
+        ensemble = agent.learned_model.ensemble  # type: ignore[attr-defined]
+        result["learned model"] = _digest(ensemble._network.parameters.detach())
+        result["held-out error"] = np.array(ensemble.held_out_error)
     assert agent.replay_buffer is not None
     for name, value in vars(agent.replay_buffer).items():
         if isinstance(value, np.ndarray):
