@@ -160,11 +160,15 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
     :param rows: of the file of results.
     :param path: of the figure.
     """
-    agents = list(dict.fromkeys(row["agent"] for row in rows))
-    figure = Figure(figsize=(5.5 * len(agents), 4), layout="constrained")
+    agents = sorted({row["agent"] for row in rows})
+    columns = min(4, len(agents))
+    lines = -(-len(agents) // columns)
+    figure = Figure(figsize=(4 * columns, 3.5 * lines), layout="constrained")
     FigureCanvasAgg(figure)
-    panels = figure.subplots(1, len(agents), squeeze=False)[0]
-    for agent, panel in zip(agents, panels, strict=True):
+    panels = figure.subplots(lines, columns, squeeze=False).ravel()
+    for panel in panels[len(agents) :]:
+        panel.set_axis_off()
+    for agent, panel in zip(agents, panels, strict=False):
         of_agent = [row for row in rows if row["agent"] == agent]
         actor = [np.mean(row["returns"]) for row in of_agent if row["arm"] == "actor alone"][-1]
         panel.axhline(actor, color="grey", linestyle=":", label="actor alone")
@@ -186,10 +190,10 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
         panel.set(xscale="log", xlabel="simulated steps per decision", ylabel="return", title=agent)
         panel.set_xticks(BUDGETS, [str(budget) for budget in BUDGETS])
         panel.minorticks_off()
-        panel.set_xticks(BUDGETS, [str(budget) for budget in BUDGETS])
-        panel.minorticks_off()
-        panel.legend(fontsize=8)
-    figure.savefig(path, dpi=120)
+    labelled = [panel.get_legend_handles_labels() for panel in panels]
+    handles = {label: handle for pair in labelled for handle, label in zip(*pair, strict=True)}
+    figure.legend(handles.values(), handles, loc="outside lower center", ncols=len(handles))
+    figure.savefig(path, dpi=90)
 
 
 def main() -> None:
