@@ -67,7 +67,7 @@ class PlanningTD3(MCBSTD3):
 
     def _sample_action(self, *args: Any, **kwargs: Any) -> tuple[np.ndarray, np.ndarray]:
         assert self._searcher is not None
-        self._root = self._searcher._read_roots([0])[0]
+        self._root = self._searcher.read_roots([0])[0]
         return super()._sample_action(*args, **kwargs)
 
     def _store_transition(self, replay_buffer: ReplayBuffer, *args: Any, **kwargs: Any) -> None:

@@ -23,6 +23,12 @@ EFFICIENT: dict[str, Any] = {
     "include_policy_action": True,
 }
 HALF: dict[str, Any] = {"search_share": 0.5, "search_unit": "episode"}
+#: From all episodes to none.
+FADING: dict[str, Any] = {
+    "search_schedule": "anneal",
+    "final_search_share": 0.0,
+    "search_unit": "episode",
+}
 #: Targets of 3 steps, of which two are simulated, for half of every batch.
 EXPANSION: dict[str, Any] = {"value_expansion": 2}
 ON_TOP: dict[str, Any] = {"action_noise_after_search": True}
@@ -36,10 +42,7 @@ ARMS: dict[str, tuple[type[TD3], dict[str, Any]]] = {
     "half": (MCBSTD3, EFFICIENT | HALF),
     "half_steps": (MCBSTD3, EFFICIENT | {"search_share": 0.5}),
     "anneal": (MCBSTD3, EFFICIENT | {"search_schedule": "anneal", "final_search_share": 0.0}),
-    "anneal_episodes": (
-        MCBSTD3,
-        EFFICIENT | {"search_schedule": "anneal", "final_search_share": 0.0, "search_unit": "episode"},
-    ),
+    "anneal_episodes": (MCBSTD3, EFFICIENT | FADING),
     "half_noise": (MCBSTD3, EFFICIENT | HALF | ON_TOP),
     "half_n3": (MCBSTD3, EFFICIENT | HALF | {"n_steps": 3}),
     "half_replay": (MCBSTD3, EFFICIENT | HALF | {"rollout_replay": 0.5}),
@@ -54,4 +57,6 @@ ARMS: dict[str, tuple[type[TD3], dict[str, Any]]] = {
         EFFICIENT | HALF | EXPANSION | {"imitation": 0.1, "replan": True},
     ),
     "efficient_expansion": (MCBSTD3, EFFICIENT | EXPANSION),
+    "anneal_expansion": (MCBSTD3, EFFICIENT | EXPANSION | FADING),
+    "half_noise_expansion": (MCBSTD3, EFFICIENT | HALF | EXPANSION | ON_TOP),
 }

@@ -46,6 +46,14 @@ class DictPendulum(gym.ObservationWrapper):
         return {"angle": observation[:2], "speed": observation[2:]}
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _loggers_leave_nothing(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """SB3's logger makes a folder for every agent that learns, in the system's temporary folder if untold."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SB3_LOGDIR", str(tmp_path_factory.mktemp("loggers")))
+        yield
+
+
 @pytest.fixture
 def make_agent() -> Callable[..., MCBS]:
     """Build a small MCBSTD3, or another algorithm; keyword arguments override its settings."""

@@ -238,6 +238,7 @@ class ReferenceRefine:
     :param include_policy_action: whether the policy alone is a plan of the first round
     :param hold: environment steps for which each offset of a plan stays
     :param directions: ``[dims, act_dim]``, along which plans differ; the noise has those coordinates
+    :param clip_at: what no entry of a plan exceeds
     """
 
     def __init__(
@@ -250,8 +251,9 @@ class ReferenceRefine:
         include_policy_action: bool = False,
         hold: int = 1,
         directions: np.ndarray | None = None,
+        clip_at: float = math.inf,
     ) -> None:
-        self.hold, self.directions = hold, directions
+        self.hold, self.directions, self.clip_at = hold, directions, clip_at
         self.reference, self.width, self.n_elites = reference, width, n_elites
         self.spreads, self.min_noise = spreads, min_noise
         self.include_policy_action = include_policy_action
@@ -274,6 +276,7 @@ class ReferenceRefine:
                 np.float32(mean + [along(z[:dims] * s, directions) for z, s in zip(one, spread, strict=True)])
                 for one in of_round
             ]
+            drawn = [np.clip(plan, -self.clip_at, self.clip_at) for plan in drawn]
             drawn[0] = mean
             if number == 0 and self.include_policy_action and mean.any():
                 drawn[1] = np.zeros_like(mean)

@@ -177,3 +177,22 @@ def test_an_agent_trains_and_acts_with_a_budget(make_agent, tmp_path):
         observations, *_ = env.step(actions)
     assert policy.last_result.rounds >= 1  # in 30 seconds, on any machine
     assert policy.last_result.values.shape[1] <= 12
+
+
+def test_the_critics_answers_are_counted():
+    clock = Clock()
+    world, pace = SlowWorld(clock), Pace(clock)
+    for _ in range(3):
+        result = decide(world, pace, 40.0)
+    assert result.critic_evaluations == 8 == result.values.size
+
+
+def test_searches_of_some_environments_do_not_spoil_the_forecasts_of_all():
+    agent = MCBSTD3(
+        "MlpPolicy", snapshot_vec_env("HalfCheetah-v5", 3), time_budget=0.05, seed=0, device="cpu"
+    )
+    agent._setup_learn(1)
+    searcher = agent._searcher
+    for envs in ([0], [0, 1, 2], [2]):
+        searcher.search(agent._last_obs, agent.search_rng, envs)
+    assert {n_envs for n_envs, _ in searcher._paces} == {1, 3}

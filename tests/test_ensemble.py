@@ -187,3 +187,29 @@ def test_it_reads_no_environment(linear):
 
 def test_the_linear_system_is_stable():
     assert np.abs(np.linalg.eigvals(MATRIX)).max() < 1 and PUSH.any()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_terminations_that_come_late_are_not_predicted_at_random(seed):
+    """Weights from before there were any know nothing of them, however good they are otherwise."""
+    rng = np.random.default_rng(seed)
+
+    def noisy(n, limit):
+        observations, actions = rng.standard_normal((n, 2)), rng.uniform(-1, 1, (n, 1))
+        following = 0.5 * observations + 0.3 * actions + 0.2 * rng.standard_normal((n, 2))
+        rewards = observations[:, 0] + 0.3 * rng.standard_normal(n)
+        return Transitions(observations, actions, following, rewards, np.float32(following[:, 0] > limit))
+
+    def fit(transitions):
+        ensemble.fit(transitions, np.arange(len(transitions.rewards)) % 10 == 9, 500, rng)
+
+    ensemble = Ensemble(3, 2, 1, rng, CPU)
+    endless = noisy(3000, np.inf)
+    for _ in range(3):
+        fit(endless)
+    both = Transitions(*(np.concatenate(parts) for parts in zip(endless, noisy(600, 1.1), strict=True)))
+    share = both.terminated.mean()
+    assert 0 < share < 0.02
+    fit(both)
+    predicted = ensemble.predict(both.observations, both.actions).terminated.mean()
+    assert predicted <= 2 * share and ensemble.termination_error <= 2 * share

@@ -277,9 +277,9 @@ def test_a_deadline_searches_in_the_directions_and_holds_noise():
 
 REFUSED = [
     (dict(noise_hold=2, rollout_depth=0), "noise_hold needs a rollout_depth"),
-    (dict(noise_hold=2, beam_noise=0.0), "noise_hold holds noise"),
-    (dict(noise_hold=2, noise_clip=0), "noise_hold holds noise"),
-    (dict(proposal_dims=2, beam_noise=0.0), "proposal_dims needs a beam_noise"),
+    (dict(noise_hold=2, beam_noise=0.0, beam_width=1), "noise_hold holds noise"),
+    (dict(noise_hold=2, noise_clip=0, beam_width=1), "noise_hold holds noise"),
+    (dict(proposal_dims=2, beam_noise=0.0, beam_width=1), "proposal_dims needs a beam_noise"),
     (dict(beam_width=1000, rollout_depth=100, noise_hold=100), r"rollout_depth \* noise_hold is"),
 ]
 

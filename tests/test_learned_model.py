@@ -34,7 +34,7 @@ LEARNS = dict(
     learning_starts=100,
     ensemble_size=2,
     ensemble_train_freq=30,
-    ensemble_gradient_steps=60,
+    ensemble_gradient_steps=120,
     ensemble_max_error=0.8,
 )
 NOISE = NormalActionNoise(np.zeros(1), 0.3 * np.ones(1))
@@ -250,6 +250,8 @@ def test_a_resumed_run_is_exact(make_agent, tmp_path, n_envs, crash_at):
             ValueError,
             "optimize_memory_usage",
         ),
+        (dict(rollout_depth=0), ValueError, "rollout_depth of 1 or more"),
+        (dict(buffer_size=50), ValueError, "buffer_size of 100 or more"),
         (dict(ensemble_size=1), ValueError, "ensemble_size"),
         (dict(ensemble_train_freq=0), ValueError, "ensemble_train_freq"),
         (dict(ensemble_gradient_steps=1.5), TypeError, "ensemble_gradient_steps"),

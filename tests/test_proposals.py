@@ -102,7 +102,7 @@ def test_common_noise_is_shared_by_all_candidates():
 def test_common_noise_makes_equal_candidates_equal():
     """Two candidates that are the same get the same value, which independent noise does not give them."""
     for common in (False, True):
-        settings = SearchSettings(2, 3, 2, common_noise=common, rollout_noise=0.3, beam_noise=0.0)
+        settings = SearchSettings(2, 3, 2, common_noise=common, rollout_noise=0.3, beam_noise=1e-30)
         values = search(LineWorld(), [0.5], settings, draw_noise(rng(), settings, 1, 1)).values[0]
         assert (values[0] == values[1]) == common
 
@@ -138,6 +138,12 @@ def test_common_noise_makes_equal_candidates_equal():
         (dict(entropy_bonus=True, strategy="refine"), "entropy_bonus works with strategy='beam' only"),
         (dict(tqc_value="median"), "tqc_value must be one of"),
         (dict(n_elites=7), "n_elites must be between 1 and 6"),
+        (dict(strategy="refine", min_noise=0.0), "n_elites of 2 or more"),
+        (dict(beam_noise=0.0), "beam_width above 1 needs a beam_noise"),
+        (dict(noise_clip=0.0), "beam_width above 1 needs a beam_noise"),
+        (dict(beam_noise=0.0, rollout_noise=0.2), "beam_width above 1 needs a beam_noise"),
+        (dict(beam_width=1, include_policy_action=True), "the only candidate"),
+        (dict(forward_model="ensemble", rollout_depth=0), "rollout_depth of 1 or more"),
         (dict(min_noise=-0.1), "min_noise"),
     ],
 )

@@ -1,8 +1,10 @@
 """Learning from the search's rollouts."""
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
@@ -258,3 +260,57 @@ def test_a_resumed_run_learns_from_the_same_rollouts(make_agent, tmp_path, cls, 
 def test_what_makes_no_sense_is_refused(make_agent, cls, settings, words):
     with pytest.raises(ValueError, match=words):
         make_agent(cls=cls, **settings)
+
+
+class Counting(gym.Env):
+    """A point whose observation has a discrete part, a plain int as Gymnasium's spaces sample it."""
+
+    observation_space = spaces.Dict(x=spaces.Box(-10, 10, (2,), np.float32), count=spaces.Discrete(3))
+    action_space = spaces.Box(-1, 1, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x, self.t = np.zeros(2, dtype=np.float32), 0
+        return self._observe(), {}
+
+    def step(self, action):
+        self.x, self.t = self.x + np.float32(0.1) * action[0], self.t + 1
+        return self._observe(), -float(abs(self.x[0] - 1)), False, self.t >= 7, {}
+
+    def _observe(self):
+        return {"x": self.x.copy(), "count": self.t % 3}
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5])
+@pytest.mark.parametrize("cls", SEARCHING)
+def test_discrete_parts_of_observations(make_agent, cls, share):
+    agent = make_agent(DummyVecEnv([Counting] * 2), cls=cls, policy="MultiInputPolicy", rollout_replay=share)
+    agent.learn(80)
+    if share:
+        held = agent.replay_buffer.rollout_observations["count"]
+        assert held.shape[-1] == 1 and set(np.unique(held)) == {0, 1, 2}
+
+
+def test_rollouts_whose_observation_is_overwritten_are_forgotten(make_agent, monkeypatch):
+    """With optimize_memory_usage the last observation of a step is the first of the next row."""
+    agent = make_agent(
+        "InvertedPendulum-v5",
+        buffer_size=40,
+        rollout_replay=0.5,
+        optimize_memory_usage=True,
+        replay_buffer_kwargs=dict(handle_timeout_termination=False),
+    )
+    agent.learn(100)
+    buffer = agent.replay_buffer
+    assert buffer.full and not buffer.rollout_lengths[buffer.pos].any()
+    assert buffer.rollout_count == np.count_nonzero(buffer.rollout_lengths) > 0
+    searcher, held = agent._searcher, np.argwhere(buffer.rollout_lengths > 0)
+    assert len(np.unique(held[:, 0])) == 39 and searcher is not None
+
+
+@pytest.mark.parametrize("cls", SEARCHING)
+def test_parts_are_never_more_than_the_batch(make_agent, cls):
+    shares = dict(rollout_replay=0.5, value_expansion=1, expanded_share=0.5)
+    agent = make_agent("InvertedPendulum-v5", cls=cls, batch_size=7, **shares)
+    agent.learn(40)
+    assert agent._n_updates > 0

@@ -7,6 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, CheckpointCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
@@ -135,7 +136,9 @@ def test_before_learning_starts_it_is_the_agent_without_search(make_agent, cls, 
 def test_search_is_around_the_mean_action(make_agent, cls, settings):
     """Neither the actor's distribution nor gSDE decides what is searched, however wide they are."""
     policy_kwargs = dict(net_arch=[16], log_std_init=1.0) if settings else dict(net_arch=[16])
-    agent = make_agent(cls=cls, beam_noise=0, policy_kwargs=policy_kwargs, learning_rate=0.0, **settings)
+    agent = make_agent(
+        cls=cls, beam_width=1, beam_noise=0, policy_kwargs=policy_kwargs, learning_rate=0.0, **settings
+    )
     agent.learn(40)
     observations = agent.replay_buffer.observations[20:40, 0]
     mean, _ = agent.predict(observations, deterministic=True)
@@ -270,6 +273,18 @@ def test_random_dynamics_are_simulated_with_generators_of_their_own(make_agent):
     agent.learn(40)
     assert not agent._searcher.model.deterministic
     assert agent.n_simulated_steps == 20 * 3 * 2 * 2
+
+
+def test_a_tree_does_not_follow_the_luckiest_draw_once_dynamics_turn_out_random(make_agent, monkeypatch):
+    """The batched simulator is given up for copies first, which are found to be random then."""
+    agent = make_agent("InvertedPendulum-v5", strategy="tree", n_simulations=1, branching=2)
+    agent.learn(30)
+    assert agent._searcher.model.kind == "mujoco"
+    step = InvertedPendulumEnv.step
+    gust = "step", lambda self, action: step(self, action + self.np_random.normal(scale=0.3, size=1))
+    monkeypatch.setattr(InvertedPendulumEnv, *gust)
+    with pytest.warns(UserWarning), pytest.raises(ValueError, match="the luckiest draw would win"):
+        agent.learn(30, reset_num_timesteps=False)
 
 
 def test_monitor_file_counts_only_real_episodes(make_agent, tmp_path):

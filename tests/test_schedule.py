@@ -7,6 +7,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 
 from sb3_mcbs import MCBSSAC, MCBSTD3, MCBSTQC
 from sb3_mcbs.search import ScheduleSettings, SearchSchedule, SearchSettings, draw_noise
+from sb3_mcbs.search.streams import stream
 from tests.checkpoint_helpers import assert_resumed_is_exact
 from tests.conftest import SEARCHING, WITHOUT_SEARCH, assert_same_parameters, snapshot_vec_env
 
@@ -67,6 +68,27 @@ def test_what_search_adds_to_the_return_gives_no_cycling(unit, bonus):
 
     _, changes = simulate(flat, settings, 100_000, noise=20.0)
     assert [reduced for _, reduced in changes] == [True]
+
+
+@pytest.mark.parametrize("unit", ["step", "episode"])
+@pytest.mark.parametrize("noise", [320.0, 480.0, 960.0])
+def test_noisy_returns_give_no_cycling(unit, noise):
+    """Over a hundred windows some are low by chance, and the best is high by chance."""
+    settings = ScheduleSettings(**SATURATION, search_unit=unit)
+
+    def flat(step):
+        return float(np.interp(step, [0, 10_000], [-200, 3000])), 500.0
+
+    _, changes = simulate(flat, settings, 100_000, noise=noise)
+    assert [reduced for _, reduced in changes] == [True]
+
+
+@pytest.mark.parametrize("noise", [160.0, 320.0, 480.0])
+def test_a_fall_of_noisy_returns_is_noticed(noise):
+    settings = ScheduleSettings(**SATURATION)
+    _, changes = simulate(lambda step: (rising_flat_falling(step), 0), settings, 36_000, 1, noise)
+    assert [reduced for _, reduced in changes][:2] == [True, False]
+    assert 30_000 < changes[1][0] < 35_000
 
 
 def test_a_return_that_never_improved_is_not_saturated():
@@ -132,6 +154,18 @@ def test_anneals():
         (dict(search_schedule="saturation", recovery_tolerance=0.01), {}, "recovery_tolerance must be above"),
         (dict(saturation_window=0), {}, "saturation_window"),
         (dict(search_schedule="anneal", final_rollout_depth=0), {}, "both be 0 or both be 1"),
+        (dict(search_schedule="anneal"), {}, "needs something to end at"),
+        (
+            dict(search_schedule="anneal", final_beam_width=3),
+            dict(time_budget=1.0, max_beam_width=50),
+            "no meaning with max_beam_width",
+        ),
+        (
+            dict(search_schedule="anneal", final_beam_width=5, final_rollout_depth=5000),
+            dict(beam_width=20_000, rollout_depth=5, n_simulations=1),
+            "widest and deepest search of the anneal",
+        ),
+        (dict(action_noise_after_search=True), {}, "pass an action_noise"),
         (dict(search_schedule="anneal", final_rollout_depth=2), dict(strategy="refine"), "strategy='refine'"),
         (
             dict(search_schedule="anneal", final_beam_width=3),
@@ -180,6 +214,7 @@ def test_streams_do_not_depend_on_the_schedule(make_agent, cls):
             cls=cls,
             search_share=share,
             action_noise=NormalActionNoise(np.zeros(1), 0.2 * np.ones(1)),
+            seed=1,
         )
         agent.learn(24)  # the first step after 20 random ones
         first_unsearched[share] = agent.replay_buffer.actions[5]
@@ -265,6 +300,58 @@ def test_what_is_logged(make_agent):
     logged = agent.logger.name_to_value
     assert 0.5 <= logged["search/frequency"] < 0.52
     assert (logged["search/beam_width"], logged["search/rollout_depth"]) == (1, 1)
+
+
+@pytest.mark.parametrize("widths", [(6, 1), (2, 6)])
+def test_a_rollout_beyond_the_end_of_the_training_stays_at_the_end_of_the_anneal(make_agent, widths):
+    agent = make_agent(
+        search_schedule="anneal",
+        beam_width=widths[0],
+        final_beam_width=widths[1],
+        final_search_share=0.0,
+        rollout_replay=0.25,
+        train_freq=(1, "episode"),
+    )
+    agent.learn(250)
+    assert agent.num_timesteps == 400
+    logged = agent.logger.name_to_value
+    assert (logged["search/frequency"], logged["search/beam_width"]) == (0.0, widths[1])
+
+
+def test_a_second_training_begins_at_the_beginning_of_the_anneal(make_agent):
+    agent = make_agent(search_schedule="anneal", final_beam_width=1)
+    agent.learn(60)
+    agent.learning_starts = 0
+    agent.learn(1)
+    assert agent._schedule is not None and agent.logger.name_to_value["search/beam_width"] == 3
+
+
+def test_generators_have_nothing_in_common(make_agent):
+    """A schedule that draws what an environment draws would search where the environment is kind."""
+    agent = make_agent(rollout_replay=0.25, seed=7)
+    rngs = [agent.search_rng, agent._schedule.rng, agent.rollout_rng, stream(7, "learned model")]
+    drawn = [tuple(rng.random(3)) for rng in rngs]
+    assert len(set(drawn)) == 4
+    environment = tuple(np.random.default_rng(7).random(3))
+    assert environment not in drawn[1:]
+    agent.set_random_seed(7)
+    rngs = [agent.search_rng, agent._schedule.rng, agent.rollout_rng]
+    assert [tuple(rng.random(3)) for rng in rngs] == drawn[:3]
+
+
+@pytest.mark.parametrize("cls", SEARCHING)
+def test_generators_go_on_where_a_saved_agent_left_them(make_agent, tmp_path, cls):
+    agent = make_agent(cls=cls, search_share=0.5, rollout_replay=0.25)
+    agent.learn(60)
+    agent.save(tmp_path / "agent")
+
+    def states(agent):
+        rngs = agent.search_rng, agent._schedule.rng, agent.rollout_rng
+        return [rng.bit_generator.state["state"]["state"] for rng in rngs]
+
+    assert states(cls.load(tmp_path / "agent")) == states(agent)
+    reseeded = cls.load(tmp_path / "agent", custom_objects={"seed": 3})
+    assert states(reseeded) == states(make_agent(cls=cls, seed=3))
 
 
 @pytest.mark.parametrize("cls, unit", [(MCBSTD3, "step"), *((cls, "episode") for cls in SEARCHING)])

@@ -62,6 +62,7 @@ def refinement_of(reference: Reference, settings: SearchSettings) -> ReferenceRe
         first_spread(settings)[:, 0].tolist(),
         settings.min_noise,
         settings.include_policy_action,
+        clip_at=np.inf if settings.noise_clip is None else settings.noise_clip,
     )
 
 
@@ -95,6 +96,7 @@ REFINEMENTS = [
     dict(beam_width=2, n_rounds=1, rollout_depth=1),
     dict(beam_width=8, n_rounds=3, rollout_depth=3, n_elites=3),
     dict(beam_width=6, n_rounds=3, rollout_depth=4, include_policy_action=True, rollout_noise=0.1),
+    dict(beam_width=6, n_rounds=4, rollout_depth=3, n_elites=2, noise_clip=0.3),
     dict(beam_width=5, n_rounds=2, rollout_depth=3, antithetic=True, n_proposals=12, n_elites=5),
     dict(beam_width=4, n_rounds=3, rollout_depth=2, rollout_noise=0.1, min_noise=1.0),
     dict(beam_width=3, n_rounds=1, rollout_depth=2, n_proposals=60, include_policy_action=True),
@@ -297,7 +299,7 @@ def test_refinement_improves_and_keeps_its_spread():
         for seed in range(20)
     ]
     assert np.mean(gains) > 0
-    collapsed = SearchSettings(4, 2, strategy="refine", n_rounds=2, n_elites=1, min_noise=0.0)
+    collapsed = SearchSettings(4, 2, strategy="refine", n_rounds=2, n_elites=1, min_noise=1e-30)
     rounds = on_line(LineWorld(), collapsed).candidates.reshape(len(ROOTS), 2, 4)
     assert (rounds[:, 1] == rounds[:, 1, :1]).all()
     floor = SearchSettings(4, 2, strategy="refine", n_rounds=2, n_elites=1, min_noise=0.05)

@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 
 from sb3_mcbs import MCBSDDPG, MCBSSAC, MCBSTD3, MCBSTQC
-from sb3_mcbs.algorithms.networks import policy_function
+from sb3_mcbs.algorithms.networks import entropy_function, policy_function, soft_policy_function
 from sb3_mcbs.algorithms.value_expansion import ValueExpansion
 from sb3_mcbs.models import ForwardModelError
 from tests.conftest import snapshot_vec_env
@@ -38,6 +39,9 @@ class FixedRows:
     def integers(self, low, high, size):
         return self.draws.pop(0)
 
+    def standard_normal(self, shape, dtype):
+        return np.zeros(shape, dtype)  # the actor's mean, whose entropy counts all the same
+
 
 def trained(make_agent, env_id="Hopper-v5", n_envs=2, cls=MCBSTD3, env=None, **settings):
     settings = dict(value_expansion=STEPS, gamma=GAMMA, search_share=0.5) | settings
@@ -56,6 +60,7 @@ def go_on(agent, env, snapshot, reward, next_observation):
     :return: return, how many steps, whether it terminated, last observation.
     """
     policy, normalizer = policy_function(agent, target=True), agent.get_vec_normalize_env()
+    entropy = entropy_function(agent) if isinstance(agent, MCBSSAC) else lambda observation, action: [0.0]
 
     def seen(observation):
         observation = np.asarray(observation)[None]
@@ -67,9 +72,10 @@ def go_on(agent, env, snapshot, reward, next_observation):
     env.restore(snapshot)
     total, observation, terminated = scaled(reward), next_observation, False
     for length in range(1, STEPS + 1):
-        action = agent.policy.unscale_action(policy(seen(observation)))[0]
-        observation, reward, terminated, _, _ = env.step(action)
-        total += GAMMA**length * scaled(reward)
+        scaled_action = policy(seen(observation))
+        bonus = entropy(seen(observation), scaled_action)[0]
+        observation, reward, terminated, _, _ = env.step(agent.policy.unscale_action(scaled_action)[0])
+        total += GAMMA**length * (scaled(reward) + bonus)
         if terminated:
             return total, length + 1, True, observation
     return total, STEPS + 1, False, observation
@@ -171,3 +177,50 @@ def test_states_are_saved_with_the_replay_buffer(make_agent, tmp_path):
 def test_what_does_not_go_together_is_refused(make_agent, settings, error, words):
     with pytest.raises(error, match=words):
         make_agent("InvertedPendulum-v5", **settings)
+
+
+def test_an_edited_simulator_is_followed_without_any_search(make_agent):
+    agent = make_agent("InvertedPendulum-v5", value_expansion=1, search_share=0.0)
+    agent.learn(40)
+    assert agent.logger.name_to_value["search/model_error"] == 0.0 and agent.n_decisions == 0
+    agent.get_env().envs[0].unwrapped.model.actuator_gear[:] *= 0.1
+    with pytest.warns(UserWarning, match="edited"):
+        agent.learn(10, reset_num_timesteps=False)
+    env, model = agent.get_env().envs[0], agent._searcher.model
+    model.set_roots(agent._searcher.read_roots([0]), np.zeros(1, int), np.random.default_rng(0))
+    action = np.array([[2.0]], dtype=np.float32)
+    np.testing.assert_array_equal(model.step(action).observations[0], env.step(action[0])[0])
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("cls", AGENTS)
+def test_every_executed_action_is_as_it_is_simulated(make_agent, cls, dtype):
+    errors = []
+    noise = NormalActionNoise(np.zeros(3), 0.3 * np.ones(3), dtype=dtype)
+    vec_env = VecNormalize(snapshot_vec_env("Hopper-v5", 2))
+    agent = make_agent(vec_env, cls=cls, value_expansion=1, search_share=0.5, action_noise=noise)
+    batches = agent._simulated_batches
+    model_error = batches.model_error
+    batches.model_error = lambda *step: errors.append(model_error(*step)) or errors[-1]
+    agent.learn(200)
+    assert errors == [0.0] * 100, "warm-up, searched and not searched, the last step of an episode"
+    assert agent.replay_buffer.dones.any()
+
+
+@pytest.mark.parametrize("cls, sde", [(MCBSSAC, False), (MCBSTQC, False), (MCBSSAC, True)])
+def test_soft_actions_and_their_entropy_are_sb3s(make_agent, cls, sde):
+    agent = make_agent("Hopper-v5", cls=cls, use_sde=sde, ent_coef=0.2)
+    observations = (
+        np.random.default_rng(0).normal(size=(4000, 11)).astype(np.float32)[:1].repeat(4000, axis=0)
+    )
+    draw = soft_policy_function(agent)
+    actions, bonus = draw(observations, np.random.default_rng(1))
+    again, _ = draw(observations, np.random.default_rng(1))
+    np.testing.assert_array_equal(actions, again)
+    np.testing.assert_allclose(bonus, entropy_function(agent)(observations, actions), rtol=1e-3, atol=1e-3)
+    if sde:  # its exploration matrix is drawn once for all rows
+        agent.actor.reset_noise(4000)
+    theirs, log_prob = agent.actor.action_log_prob(th.as_tensor(observations))
+    np.testing.assert_allclose(actions.mean(axis=0), theirs.detach().mean(dim=0), atol=0.05)
+    np.testing.assert_allclose(actions.std(axis=0), theirs.detach().std(dim=0), atol=0.05)
+    assert bonus.mean() == pytest.approx(-0.2 * log_prob.mean().item(), abs=0.05)

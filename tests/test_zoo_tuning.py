@@ -8,10 +8,13 @@ from typing import Any
 import numpy as np
 import optuna
 import pytest
+import yaml
 
 from sb3_mcbs import SearchPolicy
+from sb3_mcbs.algorithms.keywords import SETTINGS
 from sb3_mcbs.search import SearchSettings, with_preset
 from sb3_mcbs.zoo import sampler, train
+from sb3_mcbs.zoo.paths import hyperparams_path
 from sb3_mcbs.zoo.registration import ALGORITHMS
 from tests.zoo_helpers import TINY, zoo_train
 
@@ -135,6 +138,39 @@ def test_strategies_are_tuned_when_asked(base: str, monkeypatch: pytest.MonkeyPa
     assert set(seen) == set(sampler.STRATEGIES) and min(seen.values()) >= 5
 
 
+@pytest.mark.parametrize("scope", ["search", "strategies", "schedules"])
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_trials_go_with_every_entry_of_the_files(
+    scope: str, algo: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What a trial draws and what the file holds must make an agent together, or the study would end."""
+    monkeypatch.setenv(sampler.SWITCH, scope)
+    names = {name for settings in SETTINGS for name in settings.names()}
+    entries = yaml.safe_load(hyperparams_path(algo).read_text())
+    kinds = {tuple(sorted((n, v) for n, v in entry.items() if n in names)) for entry in entries.values()}
+    for held in map(dict, kinds):
+        study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
+        n_good = 0
+        for _ in range(150):
+            trial = study.ask()
+            trial.set_user_attr(sampler.HELD, held)
+            try:
+                params = sampler.sample_mcbs_params(algo.removeprefix("mcbs_"), trial, 6, 1, dict(NO_HER))
+            except optuna.TrialPruned:
+                continue
+            n_good += 1
+            merged = {name: value for name, value in {**held, **params}.items() if name in names}
+            search, schedule, replay, expansion, _ = (
+                settings(**{name: merged[name] for name in settings.names() if name in merged})
+                for settings in SETTINGS
+            )
+            schedule.check_search(search)
+            replay.check_search(search)
+            expansion.check_search(search, replay.rollout_replay)
+        assert n_good > 15
+        assert ("n_simulations" in trial.params) == (scope == "strategies" or "rollout_noise" not in held)
+
+
 def test_unknown_scope_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(sampler.SWITCH, "td3")
     with pytest.raises(
@@ -193,6 +229,7 @@ def test_objective_is_the_actor_with_search(tmp_path: Path, monkeypatch: pytest.
     assert [trial.state.name for trial in study.trials] == ["COMPLETE"] * 2
     for trial in study.trials:
         assert trial.user_attrs["search/decisions"] == 200
+        assert trial.user_attrs[sampler.HELD]["n_threads"] == 1, "what the file and -params say of the search"
         assert trial.user_attrs["search/simulated_steps"] == 400
         assert np.isfinite(trial.value)
     assert len(list((tmp_path / "logs" / "mcbs_td3").glob("report_*.csv"))) == 1

@@ -7,7 +7,6 @@ from sb3_contrib import TQC
 from stable_baselines3 import SAC
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.preprocessing import get_action_dim
 
 logger = logging.getLogger("sb3_mcbs")
 
@@ -27,8 +26,8 @@ def explore_without_search(agent: OffPolicyAlgorithm, noise: float) -> None:
     logger.info(message)
     if agent.verbose >= 1:
         print(message)
-    n_actions = get_action_dim(agent.action_space)
-    agent.action_noise = NormalActionNoise(np.zeros(n_actions), np.full(n_actions, noise))
+    shape = agent.action_space.shape or ()
+    agent.action_noise = NormalActionNoise(np.zeros(shape), np.full(shape, noise))
 
 
 class DrawnNoise(ActionNoise):

@@ -24,6 +24,7 @@ from stable_baselines3.her import HerReplayBuffer
 
 from sb3_mcbs.models.base import Observations
 from sb3_mcbs.models.workers import await_answers, worker_error
+from sb3_mcbs.search.interface import map_arrays
 from sb3_mcbs.snapshot import SIMULATION_DIVERGED
 
 logger = logging.getLogger("sb3_mcbs")
@@ -205,7 +206,7 @@ def _what_is_not_finite(
             last = infos[index].get("terminal_observation")
             if last is None or SIMULATION_DIVERGED in infos[index]:
                 continue
-            rows = {key: value[None] for key, value in last.items()} if isinstance(last, dict) else last[None]
+            rows = map_arrays(lambda part: np.asarray(part)[None], last)
             found = _broken_rows(rows)
             if found is not None:
                 return index, f"the last observation {found[1]}, which is not finite,"

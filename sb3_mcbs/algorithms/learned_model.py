@@ -12,6 +12,7 @@ from stable_baselines3.common.preprocessing import get_action_dim
 from sb3_mcbs.models.ensemble import Ensemble, Transitions
 from sb3_mcbs.models.ensemble_model import check_observation_space
 from sb3_mcbs.search.checks import CheckedSettings
+from sb3_mcbs.search.streams import stream
 
 #: One row of the replay buffer in so many is held out: always the last of them, so that a transition that was
 #: held out is never fitted later.
@@ -66,7 +67,7 @@ class LearnedModel:
     """
 
     def __init__(self, agent: OffPolicyAlgorithm, settings: EnsembleSettings) -> None:
-        self.rng = np.random.default_rng(agent.seed)
+        self.rng = stream(agent.seed, "learned model")
         size = settings.ensemble_size
         obs_dim = spaces.flatdim(check_observation_space(agent.observation_space))
         act_dim = get_action_dim(agent.action_space)
@@ -91,6 +92,11 @@ class LearnedModel:
             raise ValueError(
                 "forward_model='ensemble' learns from the last observation of every episode, which a replay "
                 "buffer with optimize_memory_usage does not keep: leave that out."
+            )
+        if agent.buffer_size < LEAST_TRANSITIONS:
+            raise ValueError(
+                f"forward_model='ensemble' needs a buffer_size of {LEAST_TRANSITIONS} or more: with fewer "
+                f"transitions no model is fitted; got {agent.buffer_size}."
             )
         self.ensemble.to(agent.device)
 

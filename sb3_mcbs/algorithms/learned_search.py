@@ -36,8 +36,7 @@ def make_searcher(
     :param recent_actions: what the agent executed, for ``proposal_dims``; ``None``: nothing yet.
     :return: a :class:`LearnedSearcher` where a learned model simulates, else a :class:`Searcher`.
     """
-    learned = settings.forward_model == "ensemble" and settings.rollout_depth > 0
-    searcher = LearnedSearcher if learned else Searcher
+    searcher = LearnedSearcher if settings.forward_model == "ensemble" else Searcher
     return searcher(agent, vec_env, settings, normalize_reward, recent_actions)
 
 

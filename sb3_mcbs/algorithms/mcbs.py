@@ -36,6 +36,7 @@ from sb3_mcbs.search import (
     SearchSchedule,
     SearchSettings,
 )
+from sb3_mcbs.search.streams import stream
 
 SelfMCBS = TypeVar("SelfMCBS", bound="MCBS")
 
@@ -79,6 +80,7 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         self.action_noise_after_search = action_noise_after_search
 
         self.search_rng: np.random.Generator | None = None
+        self._is_restored, self._seed_at_setup = False, self.seed
         self._schedule: SearchSchedule | None = None
         self.recent_actions: RecentActions | None = None
         self.n_decisions = 0
@@ -117,7 +119,15 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
             raise TypeError(
                 f"action_noise_after_search must be True or False, got {self.action_noise_after_search!r}."
             )
+        if self.action_noise_after_search and self.action_noise is None:
+            raise ValueError(
+                "action_noise_after_search adds action_noise to searched actions, and there is none: pass an "
+                "action_noise."
+            )
+        # ``load`` seeds once more; generators that it has restored go on instead.
+        self._is_restored = self.search_rng is not None and self._seed_at_setup == self.seed
         super()._setup_model()
+        self._is_restored, self._seed_at_setup = False, self.seed
         if self.search_rng is None:
             self.search_rng = np.random.default_rng(self.seed)
         if self._schedule is None:
@@ -126,7 +136,7 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         if self.recent_actions is None and settings.proposal_dims is not None:
             self.recent_actions = RecentActions(get_action_dim(self.action_space))
         if self.rollout_rng is None:
-            self.rollout_rng = np.random.default_rng(self.seed)
+            self.rollout_rng = stream(self.seed, "rollout replay")
         self._simulated_batches = SimulatedBatches(self)
         set_up_learned_model(self)
         if self.env is not None:
@@ -151,13 +161,14 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
 
     def set_random_seed(self, seed: int | None = None) -> None:
         super().set_random_seed(seed)
-        if seed is not None:
-            self.search_rng = np.random.default_rng(seed)
-            if self._schedule is not None:
-                self._schedule.rng = np.random.default_rng(seed)
-            self.rollout_rng = np.random.default_rng(seed)
-            if self.learned_model is not None:
-                self.learned_model.rng = np.random.default_rng(seed)
+        if seed is None or self._is_restored:
+            return
+        self.search_rng = np.random.default_rng(seed)
+        if self._schedule is not None:
+            self._schedule.rng = stream(seed, "schedule")
+        self.rollout_rng = stream(seed, "rollout replay")
+        if self.learned_model is not None:
+            self.learned_model.rng = stream(seed, "learned model")
 
     def _sample_action(
         self,
@@ -175,6 +186,8 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         :return: actions ``[n_envs, *act_shape]`` to take in the environment
             and scaled actions that will be stored in the replay buffer.
         """
+        assert self._simulated_batches is not None
+        self._simulated_batches.look()
         self._decision = self._rollouts = None
         # For all environments whatever is searched, so that random streams do not depend on the schedule.
         noise = None if action_noise is None else DrawnNoise(action_noise)
@@ -206,12 +219,10 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
             self._decision = result._replace(chosen=chosen), searched
         if executed.all():
             return self.policy.unscale_action(found), found
-        # Of one kind, so that searched actions reach the environments as they were simulated.
-        actions, scaled_actions = actions.astype(found.dtype), scaled_actions.astype(found.dtype)
-        found = found[executed[searched]]
-        actions[executed] = self.policy.unscale_action(found)
-        scaled_actions[executed] = found
-        return actions, scaled_actions
+        # Of one kind, so that actions reach the environments as they are simulated.
+        scaled_actions = scaled_actions.astype(found.dtype)
+        scaled_actions[executed] = found[executed[searched]]
+        return self.policy.unscale_action(scaled_actions), scaled_actions
 
     def _search(self, envs: Sequence[int]) -> SearchResult:
         """Search in some environments, and keep their rollouts if they are learned from."""
@@ -229,7 +240,8 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
     @property
     def _progress(self) -> float:
         """How much of the training is done, from 0 to 1."""
-        return 1.0 - self._current_progress_remaining
+        # A rollout of whole episodes, say, goes on beyond ``total_timesteps``.
+        return min(max(1.0 - self._current_progress_remaining, 0.0), 1.0)
 
     def _store_transition(
         self,
@@ -254,11 +266,12 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
             return
         if self.num_timesteps - self.n_envs >= self.learning_starts:  # random actions have no directions
             self._searcher.note_actions(buffer_action)
-        if self._decision is not None:
-            error = self._searcher.model_error(*self._decision, new_obs, raw_reward, infos)
-            if error is not None:
-                self.logger.record_mean("search/model_error", error)
         assert self._simulated_batches is not None
+        error = self._simulated_batches.model_error(buffer_action, new_obs, raw_reward, infos)
+        if error is None and self._decision is not None:
+            error = self._searcher.model_error(*self._decision, new_obs, raw_reward, infos)
+        if error is not None:
+            self.logger.record_mean("search/model_error", error)
         self._simulated_batches.store(replay_buffer.pos, self._rollouts, dones)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
@@ -279,6 +292,8 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
             explore_without_search(self, self.beam_noise)
         will_reset = reset_num_timesteps or self._last_obs is None
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args, **kwargs)
+        if self._total_timesteps:  # what is known of progress is that of the training before
+            self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
         check_observations(self._last_obs)
         if will_reset:
             assert self._schedule is not None
@@ -387,5 +402,12 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         return super().predict(observation, state, episode_start, deterministic)
 
     def _excluded_save_params(self) -> list[str]:
-        transient = ["_searcher", "_decision", "_rollouts", "_checked_env", "_simulated_batches"]
+        transient = [
+            "_searcher",
+            "_decision",
+            "_rollouts",
+            "_checked_env",
+            "_simulated_batches",
+            "_is_restored",
+        ]
         return [*super()._excluded_save_params(), *transient]

@@ -97,8 +97,10 @@ class _Mixture:
         self._buffer: Any = agent.replay_buffer
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> Any:
-        counts = [round(part.share * batch_size) for part in self._parts]
-        n_own = max(batch_size - sum(counts), 0)
+        counts, n_own = [], batch_size
+        for part in self._parts:  # rounded up, two parts could be more than the batch
+            counts.append(min(round(part.share * batch_size), n_own))
+            n_own -= counts[-1]
         samples = []
         if n_own:
             own = self._buffer.sample(n_own, env=env)

@@ -242,16 +242,47 @@ def entropy_function(agent: OffPolicyAlgorithm) -> Callable[[Observations, np.nd
     def bonus(observations: Observations, actions: np.ndarray) -> np.ndarray:
         actor = policy_network.actor
         with th.no_grad():
-            tensor = obs_as_tensor(observations, agent.device)
-            mean, log_std, more = actor.get_action_dist_params(tensor)
-            distribution = actor.action_dist.proba_distribution(mean, log_std, **more)
+            distribution = _distribution(actor, obs_as_tensor(observations, agent.device))
             squashed = th.as_tensor(actions, device=agent.device)
-            if actor.use_sde:
-                log_prob = distribution.log_prob(squashed)
-            else:
-                # Where tanh is saturated its inverse is a guess; that of the policy's own action is known.
-                latent = th.where(squashed == th.tanh(mean), mean, TanhBijector.inverse(squashed))
-                log_prob = distribution.log_prob(squashed, latent)
+            mean = distribution.distribution.mean
+            # Where tanh is saturated its inverse is a guess; that of the policy's own action is known.
+            latent = th.where(squashed == th.tanh(mean), mean, TanhBijector.inverse(squashed))
+            log_prob = _log_prob(actor, distribution, squashed, latent)
             return (-entropy_coefficient(agent) * log_prob).cpu().numpy()
 
     return bonus
+
+
+def soft_policy_function(
+    agent: OffPolicyAlgorithm,
+) -> Callable[[Observations, np.random.Generator], tuple[np.ndarray, np.ndarray]]:
+    """The stochastic actor, drawn from with a generator of one's own, and what its entropy adds to the value.
+
+    :param agent: a SAC or TQC agent; its present actor and entropy coefficient are used at every call.
+    :return: observations ``[rows, *obs_shape]``, generator -> float32 actions ``[rows, act_dim]`` in [-1, 1],
+        and ``-ent_coef * log pi(a|s)`` of each, ``[rows]``.
+    """
+    policy_network: Any = agent.policy
+
+    def draw(observations: Observations, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        actor = policy_network.actor
+        with th.no_grad():
+            distribution = _distribution(actor, obs_as_tensor(observations, agent.device))
+            normal = distribution.distribution
+            noise = rng.standard_normal(tuple(normal.mean.shape), dtype=np.float32)
+            latent = normal.mean + normal.stddev * th.as_tensor(noise, device=agent.device)
+            actions = th.tanh(latent)
+            log_prob = _log_prob(actor, distribution, actions, latent)
+            return actions.cpu().numpy(), (-entropy_coefficient(agent) * log_prob).cpu().numpy()
+
+    return draw
+
+
+def _distribution(actor: Any, observations: Any) -> Any:
+    mean, log_std, more = actor.get_action_dist_params(observations)
+    return actor.action_dist.proba_distribution(mean, log_std, **more)
+
+
+def _log_prob(actor: Any, distribution: Any, squashed: th.Tensor, latent: th.Tensor) -> th.Tensor:
+    """``log pi(a|s)``; SB3's gSDE takes no latent action and inverts the squashing itself."""
+    return distribution.log_prob(squashed) if actor.use_sde else distribution.log_prob(squashed, latent)

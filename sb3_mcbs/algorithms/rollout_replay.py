@@ -1,8 +1,9 @@
 """Learning from what the search simulated: its rollouts as transitions of several steps.
 
 A search rolls every candidate out with the present actor. Each rollout is a transition of ``rollout_depth``
-steps whose later actions are the actor's own, so that the critics learn the values of actions around the
-policy, at states that were really visited, from rewards of the exact simulator. Rollouts are stored beside
+steps whose later actions are the actor's own (with ``rollout_noise=0``; otherwise with that noise, like the
+smoothing of TD3's targets), so that the critics learn the values of actions around the policy, at states that
+were really visited, from rewards of the exact simulator. Rollouts are stored beside
 the transition of the same step, in arrays of their own: they are never taken for experience.
 """
 
@@ -13,6 +14,7 @@ from typing import Any, cast
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.preprocessing import get_obs_shape
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_mcbs.algorithms.mixed_batches import Outcome, Samples, as_samples
@@ -83,6 +85,7 @@ class RolloutReplay:
 
     def __init__(self, buffer: ReplayBuffer, n_rollouts: int, rollout_depth: int) -> None:
         self.buffer = cast(Any, buffer)  # with attributes that SB3's class does not declare
+        self._shapes = get_obs_shape(buffer.observation_space)
         shape = (buffer.buffer_size, buffer.n_envs, n_rollouts)
         held = getattr(buffer, "rollout_rewards", None)
         if held is not None and held.shape == (*shape, rollout_depth):
@@ -106,8 +109,11 @@ class RolloutReplay:
         :param rollouts: of all environments; ``None`` if there are none.
         """
         buffer = self.buffer
-        buffer.rollout_count -= int(np.count_nonzero(buffer.rollout_lengths[row]))
-        buffer.rollout_lengths[row] = 0
+        self._forget(row)
+        if (
+            buffer.optimize_memory_usage
+        ):  # the last observation of this step takes the place of the next row's
+            self._forget((row + 1) % buffer.buffer_size)
         if rollouts is None:
             return
         n, depth = rollouts.rewards.shape[1:]
@@ -115,9 +121,13 @@ class RolloutReplay:
         buffer.rollout_actions[at] = rollouts.actions
         buffer.rollout_rewards[(*at, slice(None, depth))] = rollouts.rewards
         buffer.rollout_terminated[at] = rollouts.terminated
-        put_rows(buffer.rollout_observations, at, rollouts.observations, slice(None))
+        put_rows(buffer.rollout_observations, at, _as_kept(rollouts.observations, self._shapes), slice(None))
         buffer.rollout_lengths[at] = rollouts.lengths
         buffer.rollout_count += int(np.count_nonzero(rollouts.lengths))
+
+    def _forget(self, row: int) -> None:
+        self.buffer.rollout_count -= int(np.count_nonzero(self.buffer.rollout_lengths[row]))
+        self.buffer.rollout_lengths[row] = 0
 
     def sample(self, n: int, gamma: float, rng: np.random.Generator, env: VecNormalize | None) -> Samples:
         """Draw rollouts, each equally likely.
@@ -158,9 +168,16 @@ class RolloutReplay:
         return np.unravel_index(drawn[:n], shape)
 
 
+def _as_kept(observations: Observations, shapes: Any) -> Observations:
+    """Observations ``[n_envs, rollouts, *]`` in the shapes of SB3's buffers: discrete ones have an axis."""
+    if isinstance(observations, dict):
+        return {key: _as_kept(part, shapes[key]) for key, part in observations.items()}  # type: ignore[misc]
+    return observations.reshape(*observations.shape[:2], *shapes)
+
+
 def _zeros(space: spaces.Space, shape: tuple[int, ...]) -> Observations:
     if isinstance(space, spaces.Dict):
         return {key: _zeros(part, shape) for key, part in space.items()}  # type: ignore[misc]
     # Networks see float32; there are many more rollouts than transitions.
     dtype = np.float32 if space.dtype == np.float64 else space.dtype
-    return np.zeros((*shape, *(space.shape or ())), dtype)
+    return np.zeros((*shape, *cast(tuple[int, ...], get_obs_shape(space))), dtype)

@@ -1,7 +1,9 @@
 """Joins an agent's networks, the environments it acts in and a forward model to a search."""
 
 import logging
+import time
 import warnings
+from collections import defaultdict
 from collections.abc import Sequence
 from typing import Any
 
@@ -88,7 +90,8 @@ class Searcher:
         self._low, self._half_range = space.low, 0.5 * (space.high - space.low) if known else None
         self.model: ForwardModel | None = None
         self._previous_step_differed = False
-        self._pace = Pace()
+        #: Rounds of other sizes take other times.
+        self._paces: defaultdict[tuple[int, int], Pace] = defaultdict(Pace)
         self._plans: PlanMemory | None = None
         self.view: AgentView
         if settings.rollout_depth > 0:
@@ -139,7 +142,7 @@ class Searcher:
         :raises ValueError: if the observations are not those of the environments' present states.
         :raises NonFiniteError: if the networks, or the observations, are not finite.
         """
-        start = self._pace.clock()
+        start = time.perf_counter()
         if self.agent.policy.training:
             self.agent.policy.set_training_mode(False)
         roots: list[Any] = []
@@ -163,8 +166,9 @@ class Searcher:
             else:
                 assert self.model is not None
                 deadline = start + settings.time_budget
+                pace = self._paces[n_rows(observations), settings.rollout_depth]
                 result = deadline_search(
-                    self.model, roots, observations, agent, settings, deadline, self._pace, rng, directions
+                    self.model, roots, observations, agent, settings, deadline, pace, rng, directions
                 )
         if result.invalid_rollouts or not is_finite(result.actions):
             check_networks(agent.policy, agent.value, observations)
@@ -314,7 +318,7 @@ class Searcher:
         :param observations: ``[n_envs, *]``, of all environments as the agent was given them.
         :param envs: which environments.
         """
-        roots = self._read_roots(envs)
+        roots = self.read_roots(envs)
         return roots, self._present_observations(take_rows(observations, np.asarray(envs)), envs)
 
     def _present_observations(self, observations: Observations, envs: Sequence[int]) -> Observations:
@@ -339,7 +343,11 @@ class Searcher:
     def _moments(self, envs: Sequence[int]) -> list[Moment]:
         return self.environments.apply(envs, _moment)
 
-    def _read_roots(self, envs: Sequence[int]) -> list[Any]:
+    def read_roots(self, envs: Sequence[int]) -> list[Any]:
+        """Read the environments' present states, also where the simulator was exchanged.
+
+        :param envs: which environments.
+        """
         assert self.model is not None
         try:
             return self.model.read_roots(envs)
@@ -374,6 +382,7 @@ class Searcher:
         self.model.close()
         self.model = make_forward_model(self.environments, "pool", self.settings.n_threads)
         self._warn(message + f"Now simulating with: {self.model.description}.")
+        check_dynamics(self.settings, self.model.deterministic)
 
     @staticmethod
     def _warn(message: str) -> None:

@@ -40,6 +40,20 @@ class SimulatedBatches:
         self._most_rollouts = self._agent.schedule_settings.most_rollouts(self._agent.search_settings)
         self._value_expansion()
 
+    def look(self) -> None:
+        """The environments are about to be stepped."""
+        expansion = self._value_expansion()
+        if expansion is not None:
+            expansion.look()
+
+    def model_error(self, *step: Any) -> float | None:
+        """See :meth:`ValueExpansion.model_error`; ``None`` without value expansion.
+
+        :param step: its arguments.
+        """
+        expansion = self._value_expansion()
+        return None if expansion is None else expansion.model_error(*step)
+
     def store(self, row: int, rollouts: Rollouts | None, dones: np.ndarray) -> None:
         """Keep what belongs to a step of the environments.
 

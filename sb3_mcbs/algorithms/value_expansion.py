@@ -1,7 +1,8 @@
 """Targets of the critics from a few exact steps of the present actor: model-based value expansion.
 
 After a stored transition the simulator goes on, from the state that it was really in, with the actions that
-the present target actor takes (Feinberg et al., 2018, with the simulator for a model). The critics bootstrap
+the present target actor takes (of SAC and TQC: drawn from the present actor, whose entropy counts at every
+step as in their own targets; Feinberg et al., 2018, with the simulator for a model). The critics bootstrap
 some steps later: rewards are exact, actions are not old ones as in the returns of ``n_steps``, and values
 travel several steps in one update.
 """
@@ -11,17 +12,20 @@ from operator import itemgetter
 from typing import Any, cast
 
 import numpy as np
+from sb3_contrib import TQC
+from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_mcbs.algorithms.mixed_batches import Outcome, Samples, as_samples
-from sb3_mcbs.algorithms.networks import policy_function
+from sb3_mcbs.algorithms.networks import policy_function, soft_policy_function
 from sb3_mcbs.algorithms.searcher import Searcher
 from sb3_mcbs.algorithms.torch_settings import one_thread
 from sb3_mcbs.models import ForwardModelError
-from sb3_mcbs.search import SearchSettings
+from sb3_mcbs.models.base import Observations
+from sb3_mcbs.search import SearchResult, SearchSettings
 from sb3_mcbs.search.checks import CheckedSettings
-from sb3_mcbs.search.interface import map_arrays, put_rows, take_rows
+from sb3_mcbs.search.interface import FirstStep, map_arrays, put_rows, take_rows
 
 #: More steps than this after every sampled transition are a mistake.
 MAX_EXPANSION = 1000
@@ -94,7 +98,12 @@ class ValueExpansion:
 
     def __init__(self, agent: Any, searcher: Searcher) -> None:
         self._agent, self._searcher = agent, searcher
-        self._target_policy = policy_function(agent, target=True)
+        if isinstance(agent, SAC | TQC):
+            self._act = soft_policy_function(agent)
+        else:
+            policy = policy_function(agent, target=True)
+            self._act = lambda observations, rng: (policy(observations), np.zeros(len(observations)))
+        self._before: np.ndarray | None = None
         buffer = self._buffer = cast(Any, agent.replay_buffer)
         shape = (buffer.buffer_size, buffer.n_envs)
         held = getattr(buffer, "expansion_states", None)
@@ -104,13 +113,51 @@ class ValueExpansion:
             buffer.expansion_held = np.zeros(shape, dtype=bool)
 
     def _states(self, envs: range) -> np.ndarray:
-        model = self._searcher.model
-        if model is None or model.kind != "mujoco":
+        searcher = self._searcher
+        states = searcher.read_roots(envs) if searcher.model is not None else []
+        if searcher.model is None or searcher.model.kind != "mujoco":
             raise ForwardModelError(
                 "value_expansion keeps the simulator's states in the replay buffer, which needs batched "
-                f"MuJoCo; here simulates: {self._searcher.description}. Leave value_expansion out."
+                f"MuJoCo; here simulates: {searcher.description}. Leave value_expansion out."
             )
-        return np.stack(model.read_roots(envs))
+        return np.stack(states)
+
+    def look(self) -> None:
+        """Remember the states that the environments are in before a step, for :meth:`model_error`."""
+        self._before = self._states(range(self._buffer.n_envs))
+
+    def model_error(
+        self,
+        actions: np.ndarray,
+        observations: Observations,
+        rewards: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> float | None:
+        """Compare what the simulator would have done with what the environments did, searched or not.
+
+        :param actions: ``[n_envs, act_dim]``, executed, scaled.
+        :param observations: see :meth:`Searcher.model_error`, as all else.
+        :param rewards: ``[n_envs]``.
+        :param infos: one per environment.
+        :return: see there; ``None`` as well if the states before the step are not known.
+        """
+        model, n_envs = self._searcher.model, self._buffer.n_envs
+        if self._before is None or model is None or not model.deterministic:
+            return None
+        with one_thread():
+            model.set_roots(list(self._before), np.arange(n_envs), self._agent.rollout_rng)
+            step = model.step(self._searcher.unscale(actions))
+        self._before = None
+        executed = SearchResult(
+            actions=actions,
+            chosen=np.where(step.valid, 0, -1),
+            candidates=actions[:, None],
+            values=np.zeros((n_envs, 1)),
+            first_step=FirstStep(step.observations, step.rewards),
+            simulated_steps=0,
+            invalid_rollouts=0,
+        )
+        return self._searcher.model_error(executed, range(n_envs), observations, rewards, infos)
 
     def put(self, row: int, dones: np.ndarray) -> None:
         """Store the states that the environments are in after a step.
@@ -167,11 +214,13 @@ class ValueExpansion:
         model.set_roots(list(states), np.arange(len(going)), rng)
         seen = buffer._normalize_obs(take_rows(last, going), env)
         for number in range(1, self._agent.value_expansion + 1):
-            step = model.step(searcher.unscale(self._target_policy(seen)))
+            actions, bonus = self._act(seen, rng)
+            step = model.step(searcher.unscale(actions))
             self._agent.n_simulated_steps += len(going)
             valid = np.flatnonzero(step.valid)  # a simulation that diverged ends one step earlier
             at = going[valid]
-            returns[at] += gamma**number * buffer._normalize_reward(step.rewards[valid], env)
+            rewards = buffer._normalize_reward(step.rewards[valid], env) + bonus[valid]
+            returns[at] += gamma**number * rewards
             terminated[at] = step.terminated[valid]
             lengths[at] += 1
             put_rows(last, at, searcher.view.observe(step.observations, normalize=False), valid)

@@ -79,7 +79,8 @@ class Ensemble:
         predicting the mean change and the mean reward; infinite before the first fit. Not of squares: a few
         collisions, which nobody can predict, would be all that it tells of.
     :ivar termination_error: the share of held-out transitions whose termination is predicted wrongly.
-    :ivar predicts_termination: whether a termination was among the transitions. Otherwise none is predicted.
+    :ivar predicts_termination: whether a termination was among the transitions, and held-out ones are
+        predicted no worse than by "never". Otherwise none is predicted.
     """
 
     def __init__(
@@ -151,8 +152,8 @@ class Ensemble:
     ) -> None:
         """Fit all members, from the weights that they have, until the held-out error falls no more.
 
-        What is kept are the weights with the lowest held-out error, which may be those from before. The
-        optimiser starts anew: its averages belong to the normalisation of before.
+        What is kept are the weights with the lowest held-out error, that of terminations added, which may be
+        those from before. The optimiser starts anew: its averages belong to the normalisation of before.
 
         :param transitions: all that are known.
         :param held_out: ``[n]`` bool: which of them are never fitted; some, but not all.
@@ -162,29 +163,38 @@ class Ensemble:
         rows = np.flatnonzero(~held_out)
         held = transitions.take(_spaced(np.flatnonzero(held_out), _HELD_OUT_ROWS))
         self._normalise(transitions.take(_spaced(rows, _STATISTICS_ROWS)))
-        self.predicts_termination = bool(transitions.terminated[rows].any())
+        terminates = self.predicts_termination = bool(transitions.terminated[rows].any())
         parameters = self._network.parameters
         optimizer = th.optim.AdamW([parameters], lr=LEARNING_RATE, fused=True)
-        lowest, best, looks_without_gain = self.error(held), parameters.detach().clone(), 0
+        lowest, best, looks_without_gain = self._score(held), parameters.detach().clone(), 0
         for step in range(1, max_steps + 1):
             drawn = rows[rng.integers(0, len(rows), (self._network.size, BATCH_SIZE))]
             optimizer.zero_grad()
-            self._loss(transitions.take(drawn)).backward()
+            self._loss(transitions.take(drawn), terminates).backward()
             optimizer.step()
             if step % STEPS_PER_LOOK and step < max_steps:
                 continue
-            error = self.error(held)
-            if error < lowest:
-                lowest, best, looks_without_gain = error, parameters.detach().clone(), 0
+            score = self._score(held)
+            if score < lowest:
+                lowest, best, looks_without_gain = score, parameters.detach().clone(), 0
             else:
                 looks_without_gain += 1
                 if looks_without_gain == PATIENCE:
                     break
         with th.no_grad():
             parameters.copy_(best)
-        self.held_out_error = lowest
+        self.held_out_error, self.termination_error = self.error(held), self._termination_error(held)
+        never = float(np.mean(held.terminated > 0))
+        if self.termination_error > never:
+            # Weights that know less of terminations than nothing would end simulations at random.
+            self.predicts_termination, self.termination_error = False, never
+
+    def _score(self, held: Transitions) -> float:
+        return self.error(held) + self._termination_error(held)
+
+    def _termination_error(self, held: Transitions) -> float:
         predicted = self.predict(held.observations, held.actions).terminated
-        self.termination_error = float(np.mean(predicted != (held.terminated > 0)))
+        return float(np.mean(predicted != (held.terminated > 0)))
 
     def _normalise(self, transitions: Transitions) -> None:
         self._obs_mean, self._obs_scale = _mean_and_scale(transitions.observations)
@@ -198,8 +208,8 @@ class Ensemble:
         inputs = np.concatenate([(observations - self._obs_mean) / self._obs_scale, actions], axis=-1)
         return self._tensor(inputs)
 
-    def _loss(self, batch: Transitions) -> th.Tensor:
-        """Negative log-likelihood, of transitions ``[size, rows]``."""
+    def _loss(self, batch: Transitions, terminates: bool) -> th.Tensor:
+        """Negative log-likelihood, of transitions ``[size, rows]``; of terminations too if there are any."""
         outputs = self._network(self._inputs(batch.observations, batch.actions))
         targets = self._tensor((_targets(batch) - self._target_mean) / self._target_scale)
         squares = (outputs.means - targets) ** 2
@@ -207,7 +217,7 @@ class Ensemble:
         # Weighted by the standard deviation (Seitzer et al., 2022): the plain likelihood hardly learns the
         # mean of targets that it calls noisy, and the mean is what is used.
         loss = (likelihood * th.exp(0.5 * outputs.log_variances.detach())).mean(dim=(1, 2)).sum()
-        if self.predicts_termination:
+        if terminates:
             labels = self._tensor(batch.terminated)
             logits = outputs.termination_logits
             loss = loss + functional.binary_cross_entropy_with_logits(logits, labels) * len(labels)

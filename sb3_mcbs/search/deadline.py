@@ -9,7 +9,7 @@ import numpy as np
 
 from sb3_mcbs.models.base import ForwardModel, Observations
 from sb3_mcbs.search.beam import OutOfTimeError, choose, join_rounds, rollout_values
-from sb3_mcbs.search.interface import Agent, FirstStep, SearchResult
+from sb3_mcbs.search.interface import Agent, CountedValue, FirstStep, SearchResult
 from sb3_mcbs.search.proposals import draw_noise, propose, without_first
 from sb3_mcbs.search.settings import SearchSettings
 
@@ -174,6 +174,8 @@ def deadline_search(
     :return: actions, and what the search found.
     """
     policy_actions = agent.policy(observations)
+    value = CountedValue(agent.value)
+    agent = agent._replace(value=value)
     n_envs, act_dim = policy_actions.shape
     enough = settings.max_beam_width or settings.beam_width
     candidates: list[np.ndarray] = []
@@ -207,7 +209,7 @@ def deadline_search(
 
     start = pace.clock()
     if not done:
-        return _policy_alone(policy_actions, simulated_steps)
+        return _policy_alone(policy_actions, simulated_steps)._replace(critic_evaluations=value.evaluations)
     merged = choose(
         policy_actions,
         np.concatenate(candidates, axis=1),
@@ -216,7 +218,7 @@ def deadline_search(
         simulated_steps,
     )
     pace.ending.note(pace.clock() - start)
-    return merged._replace(rounds=len(candidates))
+    return merged._replace(rounds=len(candidates), critic_evaluations=value.evaluations)
 
 
 def _policy_alone(policy_actions: np.ndarray, simulated_steps: int) -> SearchResult:

@@ -34,6 +34,23 @@ class Agent(NamedTuple):
     entropy_bonus: Callable[[Observations, np.ndarray], np.ndarray] | None = None
 
 
+class CountedValue:
+    """The critics, and how often they were asked.
+
+    :param value: see :class:`Agent`.
+
+    :ivar evaluations: pairs of an observation and an action that were valued.
+    """
+
+    def __init__(self, value: Callable[[Observations, np.ndarray], np.ndarray]) -> None:
+        self._value = value
+        self.evaluations = 0
+
+    def __call__(self, observations: Observations, actions: np.ndarray) -> np.ndarray:
+        self.evaluations += len(actions)
+        return self._value(observations, actions)
+
+
 class FirstStep(NamedTuple):
     """What the forward model says that the chosen actions will do.
 

@@ -86,7 +86,8 @@ def refine_search(
             known = np.concatenate(plans, axis=1), np.concatenate(values, axis=1)
             source = refit(source, *known, settings, beginning, directions)
         offsets = combine(round_noise[..., :dims] * source.spread[:, None], directions)
-        drawn = source.mean[:, None] + scale(offsets, 1.0, settings)
+        # The whole plan is clipped: rounds and decisions would otherwise carry its mean ever further.
+        drawn = scale(source.mean[:, None] + offsets, 1.0, settings)
         always = _put_first(drawn, source.mean, settings.include_policy_action and number == 0)
         proposed = propose(policy_actions, drawn[:, :, 0], include_policy_action=False)
         if settings.n_proposals is not None:

@@ -12,6 +12,8 @@ import numpy as np
 
 #: A window with fewer episodes says nothing.
 _LEAST = 2
+#: A fall is more than so many standard errors: over a long training a window is low by chance now and then.
+_FALL = 4.0
 _START, _END, _TOTAL, _SEARCHED = range(4)
 
 
@@ -34,8 +36,9 @@ class Saturation:
     """Decides between the full and the reduced share of searched decisions.
 
     Windows end at the present step. With the full share it compares the last one with the one before; with
-    the reduced share it compares the last one with the best since the change. Differences are measured in
-    parts of all that was gained since the training began, whatever the scale of rewards is.
+    the reduced share it compares the last one with the best that the mean of all episodes since the change
+    has been (the best window would be best by luck). Differences are measured in parts of all that was gained
+    since the training began, whatever the scale of rewards is.
 
     :ivar is_reduced: whether the share is the reduced one.
     :ivar changes: how often that has changed.
@@ -49,6 +52,8 @@ class Saturation:
         self._episodes = np.zeros((0, 4))
         self._baseline: float | None = None
         self._gain = 0.0
+        #: Of the episodes since the change, by kind: count and mean, and the best that the mean has been.
+        self._since_change: dict[bool, tuple[int, float]] = {}
         self._best: dict[bool, float] = {}
 
     def begin(self, step: int) -> None:
@@ -72,6 +77,7 @@ class Saturation:
         """
         kept = self._episodes[self._episodes[:, _END] > step - 2 * window]
         self._episodes = np.concatenate([kept, np.array(finished, dtype=float).reshape(-1, 4)])
+        self._note_since_change(finished)
         if self._baseline is None and step >= window and len(self._episodes) >= _LEAST:
             self._baseline = float(self._episodes[:, _TOTAL].mean())
         if self._since is None or self._baseline is None or step - self._since < window:
@@ -85,12 +91,11 @@ class Saturation:
         self._gain = max(self._gain, rise)
         settled = step - self._since >= 2 * window
         if self.is_reduced:
-            change = _difference(last, self._best)
-            if settled and change is not None and change < -recovery * self._gain:
+            if settled and self._has_fallen(comparable, last, recovery * self._gain):
                 self._change(step)
-                return
-            for kind, mean in _means(last).items():
-                self._best[kind] = max(mean, self._best.get(kind, mean))
+            elif settled:
+                for kind, (_, mean) in self._since_change.items():
+                    self._best[kind] = max(mean, self._best.get(kind, mean))
         elif settled:
             change = _difference(last, _means(before))
             # A return that has never risen above its own noise is not saturated: it has yet to improve.
@@ -98,11 +103,34 @@ class Saturation:
             if has_risen and change is not None and abs(change) <= tolerance * self._gain:
                 self._change(step)
 
+    def _note_since_change(self, finished: Sequence[Episode]) -> None:
+        for episode in finished:
+            if self._since is not None and episode.start >= self._since:
+                count, mean = self._since_change.get(episode.searched, (0, 0.0))
+                mean += (episode.total - mean) / (count + 1)
+                self._since_change[episode.searched] = count + 1, mean
+
+    def _has_fallen(self, comparable: np.ndarray, last: np.ndarray, least: float) -> bool:
+        """Whether the last window is below the best by more than the least fall, and by more than chance."""
+        change = _difference(last, self._best)
+        if change is None:
+            return False
+        counts = {
+            kind: np.count_nonzero(last[:, _SEARCHED] == kind) for kind in _means(last).keys() & self._best
+        }
+        variance = sum(
+            (count / sum(counts.values())) ** 2
+            * comparable[comparable[:, _SEARCHED] == kind, _TOTAL].var(ddof=1)
+            * (1 / count + 1 / self._since_change[kind][0])
+            for kind, count in counts.items()
+        )
+        return -change > max(least, _FALL * variance**0.5)
+
     def _change(self, step: int) -> None:
         self.is_reduced = not self.is_reduced
         self.changes += 1
         self._since = step
-        self._best = {}
+        self._since_change, self._best = {}, {}
 
 
 def _means(episodes: np.ndarray) -> dict[bool, float]:

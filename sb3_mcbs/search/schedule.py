@@ -8,6 +8,7 @@ import numpy as np
 from sb3_mcbs.search.checks import CheckedSettings
 from sb3_mcbs.search.saturation import Episode, Saturation
 from sb3_mcbs.search.settings import MAX_DEPTH, MAX_ROLLOUTS, SearchSettings
+from sb3_mcbs.search.streams import stream
 
 SCHEDULES = ("constant", "saturation", "anneal")
 UNITS = ("step", "episode")
@@ -77,6 +78,12 @@ class ScheduleSettings(CheckedSettings):
                 raise ValueError(
                     f"{name} has no meaning with {chosen}: leave it out, or use {schedules[0]!r}."
                 )
+        ends = (self.final_search_share, self.final_beam_width, self.final_rollout_depth)
+        if self.search_schedule == "anneal" and ends == (None, None, None):
+            raise ValueError(
+                f"{chosen} needs something to end at: final_search_share, final_beam_width or "
+                "final_rollout_depth."
+            )
         if self.search_schedule == "saturation":
             if self.search_share <= self.share_at_end:
                 raise ValueError(
@@ -123,10 +130,18 @@ class ScheduleSettings(CheckedSettings):
                     "rollout_depth and final_rollout_depth must both be 0 or both be 1 or more; got "
                     f"{settings.rollout_depth} and {self.final_rollout_depth}."
                 )
-        try:
-            _with(settings, **self.annealed(settings, progress=1.0))
-        except ValueError as reason:
-            raise ValueError(f"At the end of the anneal: {reason}") from reason
+        if self.final_beam_width is not None and settings.max_beam_width is not None:
+            raise ValueError(
+                "final_beam_width has no meaning with max_beam_width, which is the number of candidates that "
+                "is enough: leave one of the two out."
+            )
+        end = self.annealed(settings, progress=1.0)
+        largest = {name: max(getattr(settings, name), value) for name, value in end.items()}
+        for when, changes in (("At the end of", end), ("With the widest and deepest search of", largest)):
+            try:
+                _with(settings, **changes)
+            except ValueError as reason:
+                raise ValueError(f"{when} the anneal: {reason}") from reason
 
     def annealed(self, settings: SearchSettings, progress: float) -> dict[str, int]:
         """What is annealed, at some moment of the training.
@@ -168,7 +183,7 @@ class SearchSchedule:
 
     def __init__(self, settings: ScheduleSettings, seed: int | None) -> None:
         self.settings = settings
-        self.rng = np.random.default_rng(seed)
+        self.rng = stream(seed, "schedule")
         self.saturation = Saturation()
         self._last_step = 0
         self.begin_episodes(0, 0)

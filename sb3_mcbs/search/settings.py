@@ -20,6 +20,8 @@ MAX_THREADS = 1024
 MATMUL_PRECISIONS = ("highest", "high", "medium")
 STRATEGIES = ("beam", "tree", "refine")
 TQC_VALUES = ("mean", "truncated")
+#: Settings of how, not of what, is computed: no preset or trial is about them.
+OF_THE_MACHINE = ("n_threads", "forward_model", "matmul_precision")
 
 
 @dataclass(frozen=True)
@@ -33,8 +35,8 @@ class SearchSettings(CheckedSettings):
     :param beam_noise: standard deviation of the Gaussian noise that makes candidates of the policy's
         action (``sigma_b``), in the action space scaled to [-1, 1].
     :param rollout_noise: the same for the later actions of a rollout. ``None``: as ``beam_noise``.
-    :param noise_clip: noise is clipped to [-noise_clip, noise_clip]. ``None``: not clipped, as in the
-        paper's Algorithm 1.
+    :param noise_clip: noise (of a refinement: what its plans add to the policy's actions) is clipped to
+        [-noise_clip, noise_clip]. ``None``: not clipped, as in the paper's Algorithm 1.
     :param include_policy_action: whether the policy's own action takes the place of the first
         candidate. ``False``, as in the paper, makes all candidates noisy.
     :param n_threads: threads that simulate. 0: one per available processor core. The result does not
@@ -128,6 +130,10 @@ class SearchSettings(CheckedSettings):
         if self.matmul_precision is not None:
             self._check_name("matmul_precision", MATMUL_PRECISIONS, "None")
 
+        if self.forward_model == "ensemble" and self.rollout_depth == 0:
+            raise ValueError(
+                "forward_model='ensemble' needs a rollout_depth of 1 or more: with 0 nothing is simulated."
+            )
         self._check_strategy()
         self._check_proposals()
         self._check_common_noise()
@@ -181,23 +187,46 @@ class SearchSettings(CheckedSettings):
                 raise ValueError("max_beam_width needs a time_budget; without one set beam_width.")
 
     def _check_strategy(self) -> None:
-        if self.strategy == "beam":
-            return
         chosen = f"strategy={self.strategy!r}"
+        if self.strategy == "beam":
+            self._check_beam()
+            return
         if self.rollout_depth == 0:
             raise ValueError(f"{chosen} needs a rollout_depth of 1 or more; got 0.")
-        if not self._is_noisy(self.beam_noise):
+        if not self.is_noisy(self.beam_noise):
             raise ValueError(
                 f"{chosen} needs a beam_noise above 0, and a noise_clip above 0 if it is set: all "
                 "candidates would be the same."
             )
-        if self.strategy == "refine" and self.beam_width == 1:
-            raise ValueError(f"{chosen} needs a beam_width of 2 or more; got 1.")
+        if self.strategy == "refine":
+            self._check_refinement()
         is_deep = self.strategy == "tree" and self.rollout_depth > 1 and self.branching > 1
-        if is_deep and not self._is_noisy(self.effective_rollout_noise):
+        if is_deep and not self.is_noisy(self.effective_rollout_noise):
             raise ValueError(
                 f"{chosen} needs a rollout_noise above 0 (None: as beam_noise), or branching=1: all children "
                 "of a node would be the same."
+            )
+
+    def _check_beam(self) -> None:
+        most = self.max_beam_width or self.beam_width
+        if most > 1 and not self.is_noisy(self.beam_noise):
+            raise ValueError(
+                "beam_width above 1 needs a beam_noise above 0, and a noise_clip above 0 if it is set: all "
+                "candidates would be the policy's own action."
+            )
+        if most == 1 and self.include_policy_action and self.n_proposals is None:
+            raise ValueError(
+                "include_policy_action needs a beam_width of 2 or more: the policy's own action would be the "
+                "only candidate."
+            )
+
+    def _check_refinement(self) -> None:
+        if self.beam_width == 1:
+            raise ValueError("strategy='refine' needs a beam_width of 2 or more; got 1.")
+        if self.n_rounds > 1 and self.effective_n_elites == 1 and self.min_noise == 0:
+            raise ValueError(
+                "strategy='refine' needs n_elites of 2 or more with min_noise=0: one elite has no spread, "
+                "and all later rounds would repeat it (n_elites=None is a quarter of beam_width)."
             )
 
     def _check_proposals(self) -> None:
@@ -225,7 +254,7 @@ class SearchSettings(CheckedSettings):
             )
         # The last action of a rollout has noise too, but a tree's leaves have no later actions.
         steps = self.rollout_depth - (self.strategy == "tree")
-        if steps == 0 or not self._is_noisy(self.effective_rollout_noise):
+        if steps == 0 or not self.is_noisy(self.effective_rollout_noise):
             raise ValueError(
                 "common_noise shares the noise of later actions; there is none with this rollout_depth, "
                 "rollout_noise and noise_clip: leave it out."
@@ -250,18 +279,22 @@ class SearchSettings(CheckedSettings):
                 raise ValueError(
                     "noise_hold needs a rollout_depth of 1 or more: with 0 nothing is simulated."
                 )
-            if not self._is_noisy(max(self.beam_noise, self.effective_rollout_noise)):
+            if not self.is_noisy(max(self.beam_noise, self.effective_rollout_noise)):
                 raise ValueError(
                     "noise_hold holds noise; there is none with this beam_noise, rollout_noise and "
                     "noise_clip: leave it out."
                 )
-        if self.proposal_dims is not None and not self._is_noisy(self.beam_noise):
+        if self.proposal_dims is not None and not self.is_noisy(self.beam_noise):
             raise ValueError(
                 "proposal_dims needs a beam_noise above 0, and a noise_clip above 0 if it is set: without "
                 "noise there are no directions."
             )
 
-    def _is_noisy(self, spread: float) -> bool:
+    def is_noisy(self, spread: float) -> bool:
+        """Whether noise of a standard deviation is any noise at all.
+
+        :param spread: the standard deviation.
+        """
         return spread > 0 and self.noise_clip != 0
 
     @property
@@ -286,7 +319,7 @@ class SearchSettings(CheckedSettings):
         :return: ``n_simulations``, or 1 where nothing is random.
         """
         # Only Algorithm 1 draws the later actions of each simulation anew.
-        noisy = self.strategy == "beam" and self.effective_rollout_noise > 0
+        noisy = self.strategy == "beam" and self.is_noisy(self.effective_rollout_noise)
         return self.n_simulations if noisy or not deterministic else 1
 
     def simulated_steps(self, deterministic: bool = True) -> int:

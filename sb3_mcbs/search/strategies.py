@@ -8,7 +8,7 @@ import numpy as np
 
 from sb3_mcbs.models.base import ForwardModel, Observations
 from sb3_mcbs.search.beam import beam_search
-from sb3_mcbs.search.interface import Agent, SearchResult
+from sb3_mcbs.search.interface import Agent, CountedValue, SearchResult
 from sb3_mcbs.search.memory import Moment, PlanMemory
 from sb3_mcbs.search.proposals import draw_noise
 from sb3_mcbs.search.refine import draw_plan_noise, refine_search
@@ -55,16 +55,10 @@ def search(decision: Decision) -> SearchResult:
     :param decision: what there is to decide.
     :return: actions, and what the search found.
     """
-    evaluations = 0
-
-    def value(observations: Observations, actions: np.ndarray) -> np.ndarray:
-        nonlocal evaluations
-        evaluations += len(actions)
-        return decision.agent.value(observations, actions)
-
+    value = CountedValue(decision.agent.value)
     strategy = STRATEGIES[decision.settings.strategy]
     result = strategy(decision._replace(agent=decision.agent._replace(value=value)))
-    return result._replace(critic_evaluations=evaluations)
+    return result._replace(critic_evaluations=value.evaluations)
 
 
 def check_dynamics(settings: SearchSettings, deterministic: bool) -> None:

@@ -13,6 +13,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_mcbs.algorithms.keywords import SETTINGS
 from sb3_mcbs.algorithms.rollout_replay import RolloutReplaySettings
 from sb3_mcbs.algorithms.value_expansion import ValueExpansionSettings
 from sb3_mcbs.checkpoints import CheckpointError, ExactCheckpointCallback
@@ -20,17 +21,17 @@ from sb3_mcbs.checkpoints.resume import continue_with
 from sb3_mcbs.checkpoints.resumption import Resumption
 from sb3_mcbs.models import ForwardModelError
 from sb3_mcbs.search import ScheduleSettings, SearchSettings, with_preset
+from sb3_mcbs.search.settings import OF_THE_MACHINE
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 from sb3_mcbs.zoo.callbacks import SearchEvalCallback, SecondEvalCallback
 from sb3_mcbs.zoo.paths import hyperparams_path, sibling_folder
 from sb3_mcbs.zoo.registration import ALGORITHMS
+from sb3_mcbs.zoo.sampler import HELD
 
 #: ``-conf sb3_mcbs`` names this package's file for the algorithm of the command line.
 PACKAGE_CONFIG = "sb3_mcbs"
 #: Agents with a policy and critics that a search can be put on.
 SEARCHABLE = ("ddpg", "sac", "td3", "tqc")
-#: Settings that no preset is about.
-OF_THE_MACHINE = ("n_threads", "forward_model", "matmul_precision")
 #: The folder of exact checkpoints within a run's folder.
 CHECKPOINTS = "checkpoints"
 
@@ -127,10 +128,17 @@ class MCBSExperimentManager(ExperimentManager):
         """
         Evaluate a trial as RL Zoo does, and prune one that asks more of the simulator than it can.
 
+        What the hyperparameter file says of the search is noted with the trial, so that the sampler draws
+        nothing that does not go with it.
+
         :param trial: Optuna's trial
         :return: the return that is maximised
         :raises optuna.TrialPruned: also where RL Zoo prunes
         """
+        if self.algo in ALGORITHMS:
+            names = {name for settings in SETTINGS for name in settings.names()}
+            held = {name: value for name, value in self._hyperparams.items() if name in names}
+            trial.set_user_attr(HELD, held)
         try:
             return super().objective(trial)
         except ForwardModelError as reason:

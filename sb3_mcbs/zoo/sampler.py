@@ -9,6 +9,7 @@ what a trial does not draw.
 """
 
 import os
+from dataclasses import asdict
 from typing import Any
 
 import optuna
@@ -19,7 +20,7 @@ from sb3_mcbs.algorithms.value_expansion import ValueExpansionSettings
 from sb3_mcbs.search import ScheduleSettings, SearchSettings
 from sb3_mcbs.search.checks import CheckedSettings
 from sb3_mcbs.search.schedule import SCHEDULES, UNITS
-from sb3_mcbs.search.settings import TQC_VALUES
+from sb3_mcbs.search.settings import OF_THE_MACHINE, TQC_VALUES
 
 SWITCH = "SB3_MCBS_TUNE"
 SCOPES = ("search", "strategies", "schedules", "all")
@@ -48,6 +49,13 @@ _HELPERS = ("proposal_factor", "noise_free_rollouts", "final_share_factor")
 
 _NO_PRESET: dict[str, Any] = {"preset": None}
 
+#: The user attribute of a trial that says what the hyperparameter file holds of the search.
+HELD = "held_settings"
+#: What the scope "strategies" replaces of those where it draws nothing.
+_STRATEGY: dict[str, Any] = {
+    name: value for name, value in asdict(SearchSettings()).items() if name not in OF_THE_MACHINE
+}
+
 
 def tuning_scope() -> str:
     """
@@ -75,18 +83,20 @@ def sample_mcbs_params(
     :raises optuna.TrialPruned: for settings that do not go together, or of too long a search
     """
     scope = tuning_scope()
+    held = trial.user_attrs.get(HELD, {})
     sampled: dict[str, Any] = {
         "beam_width": trial.suggest_categorical("beam_width", BEAM_WIDTHS),
         "rollout_depth": trial.suggest_categorical("rollout_depth", ROLLOUT_DEPTHS),
-        "n_simulations": trial.suggest_categorical("n_simulations", N_SIMULATIONS),
         "beam_noise": trial.suggest_float("beam_noise", *BEAM_NOISE, log=True),
     }
+    if scope == "strategies" or held.get("rollout_noise") != 0:  # else simulations have nothing to differ in
+        sampled["n_simulations"] = trial.suggest_categorical("n_simulations", N_SIMULATIONS)
     if scope == "strategies":
         sampled |= _sample_strategy(trial, base, sampled["rollout_depth"])
     if scope == "schedules":
         sampled |= _sample_schedule(trial)
     params = _search_settings(sampled)
-    reason = _why_senseless(params, sampled, n_actions)
+    reason = _why_senseless({"n_simulations": 1, **held, **params}, sampled, n_actions)
     if reason is not None:
         trial.set_user_attr("pruned", reason)
         raise optuna.TrialPruned(f"{reason}: {params}")
@@ -139,6 +149,8 @@ def _sample_schedule(trial: optuna.Trial) -> dict[str, Any]:
 def _search_settings(sampled: dict[str, Any]) -> dict[str, Any]:
     """Turn what a trial stores of the search into settings."""
     settings = {name: value for name, value in sampled.items() if name not in _HELPERS}
+    if "strategy" in sampled:
+        settings = {**_STRATEGY, **settings}
     if sampled.get("noise_free_rollouts"):
         settings["rollout_noise"] = 0.0
     if settings.get("strategy", "beam") != "beam":
@@ -154,7 +166,8 @@ def _search_settings(sampled: dict[str, Any]) -> dict[str, Any]:
 def _why_senseless(params: dict[str, Any], sampled: dict[str, Any], n_actions: int) -> str | None:
     if params["rollout_depth"] == 0 and params["n_simulations"] > 1:
         return "nothing is simulated at rollout_depth 0, so n_simulations above 1 repeats another trial"
-    if sampled["n_simulations"] > 1 and (params["n_simulations"] == 1 or params.get("rollout_noise") == 0):
+    drawn = sampled.get("n_simulations", 1)
+    if drawn > 1 and (params["n_simulations"] == 1 or params.get("rollout_noise") == 0):
         return "n_simulations above 1 needs a beam with noise in its rollouts, else it repeats another trial"
     if (params.get("proposal_dims") or 0) >= n_actions:
         return f"proposal_dims of {n_actions} or more repeats another trial: actions have no more directions"
