@@ -251,7 +251,6 @@ def test_a_resumed_run_is_exact(make_agent, tmp_path, n_envs, crash_at):
             "optimize_memory_usage",
         ),
         (dict(rollout_depth=0), ValueError, "rollout_depth of 1 or more"),
-        (dict(buffer_size=50), ValueError, "buffer_size of 100 or more"),
         (dict(ensemble_size=1), ValueError, "ensemble_size"),
         (dict(ensemble_train_freq=0), ValueError, "ensemble_train_freq"),
         (dict(ensemble_gradient_steps=1.5), TypeError, "ensemble_gradient_steps"),
@@ -262,6 +261,21 @@ def test_a_resumed_run_is_exact(make_agent, tmp_path, n_envs, crash_at):
 def test_what_makes_no_sense_is_refused(learning_agent, settings, error, words):
     with pytest.raises(error, match=words):
         learning_agent(**settings)
+
+
+def test_a_replay_buffer_that_never_holds_enough_is_for_acting_only(learning_agent, tmp_path):
+    """RL Zoo loads agents to look at with room for one transition."""
+    with pytest.raises(ValueError, match=r"buffer_size of 100 or more.*there is room for 99"):
+        learning_agent(linear_vec_env(3), buffer_size=101).learn(1)
+    agent = learning_agent().learn(140)
+    agent.save(tmp_path / "agent")
+    loaded = MCBSTD3.load(tmp_path / "agent", buffer_size=1, device="cpu")
+    policy = SearchPolicy(loaded, linear_vec_env())
+    policy.predict(policy.vec_env.reset())
+    assert policy.last_result.chosen[0] >= 0
+    critics_alone = SearchPolicy(loaded, linear_vec_env(), rollout_depth=0, n_simulations=1)
+    critics_alone.predict(critics_alone.vec_env.reset())
+    assert critics_alone.last_result.simulated_steps == 0
 
 
 def test_dict_observations_are_refused(learning_agent, make_dict_env):

@@ -142,7 +142,6 @@ def test_common_noise_makes_equal_candidates_equal():
         (dict(beam_noise=0.0), "beam_width above 1 needs a beam_noise"),
         (dict(noise_clip=0.0), "beam_width above 1 needs a beam_noise"),
         (dict(beam_noise=0.0, rollout_noise=0.2), "beam_width above 1 needs a beam_noise"),
-        (dict(beam_width=1, include_policy_action=True), "the only candidate"),
         (dict(forward_model="ensemble", rollout_depth=0), "rollout_depth of 1 or more"),
         (dict(min_noise=-0.1), "min_noise"),
     ],

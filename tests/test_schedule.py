@@ -106,6 +106,21 @@ def test_nothing_changes_within_two_windows_of_a_change_or_without_two_episodes(
     assert simulate(lambda step: (rising_flat_falling(step), 0), short, 40_000)[1] == []
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_moderate_fall_that_lasts_is_noticed_and_a_rare_failure_is_not(seed):
+    """Some episodes end early: the mean falls by less than single returns vary."""
+    for share, is_fall in ((0.4, True), (0.03, False)):
+        rng = np.random.default_rng(seed)
+
+        def failing(step, share=share, rng=rng):
+            level = float(np.interp(step, [0, 10_000], [0, 3000]))
+            return (-200.0 if step > 30_000 and rng.random() < share else level), 0.0
+
+        _, changes = simulate(failing, ScheduleSettings(**SATURATION), 50_000)
+        assert changes[0][1] and changes[0][0] < 20_000
+        assert (len(changes) > 1 and 30_000 < changes[1][0] < 42_000) == is_fall
+
+
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
 def test_shares_of_steps_and_of_episodes(share):
     for unit in ("step", "episode"):
@@ -165,7 +180,6 @@ def test_anneals():
             dict(beam_width=20_000, rollout_depth=5, n_simulations=1),
             "widest and deepest search of the anneal",
         ),
-        (dict(action_noise_after_search=True), {}, "pass an action_noise"),
         (dict(search_schedule="anneal", final_rollout_depth=2), dict(strategy="refine"), "strategy='refine'"),
         (
             dict(search_schedule="anneal", final_beam_width=3),
@@ -280,6 +294,14 @@ def test_searched_rows_are_executed_as_they_were_simulated(make_agent):
     agent.learn(150)
     assert len(errors) > 20 and set(errors) == {0.0}
     assert 30 < agent.n_decisions < 110
+
+
+@pytest.mark.parametrize("cls", SEARCHING)
+def test_noise_after_the_search_needs_noise(make_agent, cls):
+    with pytest.raises(ValueError, match="pass an action_noise"):
+        make_agent(cls=cls, action_noise_after_search=True).learn(1)
+    if WITHOUT_SEARCH[cls].__name__ in ("TD3", "DDPG"):  # given some for what is not searched
+        make_agent(cls=cls, action_noise_after_search=True, search_share=0.5).learn(30)
 
 
 def test_a_deterministic_actor_without_noise_explores_by_the_beams(make_agent, capsys):

@@ -162,6 +162,7 @@ def test_states_are_saved_with_the_replay_buffer(make_agent, tmp_path):
         (dict(value_expansion=1, expanded_share=0.0), ValueError, "expanded_share above 0"),
         (dict(value_expansion=1, rollout_depth=0, n_simulations=1), ValueError, "rollout_depth of 1"),
         (dict(value_expansion=1, rollout_replay=0.6), ValueError, "must not exceed 1"),
+        (dict(value_expansion=1, forward_model="ensemble"), ValueError, "does without"),
         (
             dict(
                 value_expansion=1,

@@ -138,6 +138,16 @@ def test_strategies_are_tuned_when_asked(base: str, monkeypatch: pytest.MonkeyPa
     assert set(seen) == set(sampler.STRATEGIES) and min(seen.values()) >= 5
 
 
+#: Settings that a file might hold.
+UNUSUAL = [
+    ("strategy", "tree"),
+    ("strategy", "refine"),
+    ("n_elites", 2),
+    ("time_budget", 0.5),
+    ("noise_clip", 0.3),
+]
+
+
 @pytest.mark.parametrize("scope", ["search", "strategies", "schedules"])
 @pytest.mark.parametrize("algo", ALGORITHMS)
 def test_trials_go_with_every_entry_of_the_files(
@@ -148,6 +158,7 @@ def test_trials_go_with_every_entry_of_the_files(
     names = {name for settings in SETTINGS for name in settings.names()}
     entries = yaml.safe_load(hyperparams_path(algo).read_text())
     kinds = {tuple(sorted((n, v) for n, v in entry.items() if n in names)) for entry in entries.values()}
+    kinds |= {(("rollout_depth", 3), more) for more in UNUSUAL}
     for held in map(dict, kinds):
         study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
         n_good = 0
@@ -164,11 +175,13 @@ def test_trials_go_with_every_entry_of_the_files(
                 settings(**{name: merged[name] for name in settings.names() if name in merged})
                 for settings in SETTINGS
             )
+            assert search.noise_clip == held.get("noise_clip"), "limits are held"
             schedule.check_search(search)
             replay.check_search(search)
             expansion.check_search(search, replay.rollout_replay)
-        assert n_good > 15
-        assert ("n_simulations" in trial.params) == (scope == "strategies" or "rollout_noise" not in held)
+        assert n_good > (0 if "time_budget" in held else 15), held
+        simulations_differ = "rollout_noise" not in held and held.get("strategy", "beam") == "beam"
+        assert ("n_simulations" in trial.params) == (scope == "strategies" or simulations_differ)
 
 
 def test_unknown_scope_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

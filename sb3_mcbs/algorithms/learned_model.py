@@ -93,12 +93,21 @@ class LearnedModel:
                 "forward_model='ensemble' learns from the last observation of every episode, which a replay "
                 "buffer with optimize_memory_usage does not keep: leave that out."
             )
-        if agent.buffer_size < LEAST_TRANSITIONS:
+        self.ensemble.to(agent.device)
+
+    @staticmethod
+    def check_room(buffer: ReplayBuffer) -> None:
+        """Refuse to train with a replay buffer that never holds enough to fit a model.
+
+        :param buffer: the replay buffer. One for acting only may be smaller.
+        :raises ValueError: if it does not.
+        """
+        room = buffer.buffer_size * buffer.n_envs
+        if room < LEAST_TRANSITIONS:
             raise ValueError(
                 f"forward_model='ensemble' needs a buffer_size of {LEAST_TRANSITIONS} or more: with fewer "
-                f"transitions no model is fitted; got {agent.buffer_size}."
+                f"transitions no model is fitted; there is room for {room}."
             )
-        self.ensemble.to(agent.device)
 
     def fit_if_due(self, agent: OffPolicyAlgorithm, settings: EnsembleSettings) -> None:
         """Fit the ensemble to the replay buffer if ``ensemble_train_freq`` steps have passed.

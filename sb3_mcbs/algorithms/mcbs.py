@@ -58,6 +58,9 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
     docstring of such a class the settings are listed one by one where ``search_settings`` was written.
     """
 
+    _seed_at_setup: int | None = None
+    _is_restored = False
+
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
         list_search_settings(cls)
@@ -80,7 +83,6 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         self.action_noise_after_search = action_noise_after_search
 
         self.search_rng: np.random.Generator | None = None
-        self._is_restored, self._seed_at_setup = False, self.seed
         self._schedule: SearchSchedule | None = None
         self.recent_actions: RecentActions | None = None
         self.n_decisions = 0
@@ -119,15 +121,11 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
             raise TypeError(
                 f"action_noise_after_search must be True or False, got {self.action_noise_after_search!r}."
             )
-        if self.action_noise_after_search and self.action_noise is None:
-            raise ValueError(
-                "action_noise_after_search adds action_noise to searched actions, and there is none: pass an "
-                "action_noise."
-            )
         # ``load`` seeds once more; generators that it has restored go on instead.
         self._is_restored = self.search_rng is not None and self._seed_at_setup == self.seed
         super()._setup_model()
-        self._is_restored, self._seed_at_setup = False, self.seed
+        del self._is_restored
+        self._seed_at_setup = self.seed
         if self.search_rng is None:
             self.search_rng = np.random.default_rng(self.seed)
         if self._schedule is None:
@@ -290,6 +288,14 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
     ) -> tuple[int, BaseCallback]:
         if not self.schedule_settings.searches_always or self.learned_model is not None:
             explore_without_search(self, self.beam_noise)
+        if self.action_noise_after_search and self.action_noise is None:
+            raise ValueError(
+                "action_noise_after_search adds action_noise to searched actions, and there is none: pass an "
+                "action_noise."
+            )
+        if self.learned_model is not None:
+            assert self.replay_buffer is not None
+            self.learned_model.check_room(self.replay_buffer)
         will_reset = reset_num_timesteps or self._last_obs is None
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args, **kwargs)
         if self._total_timesteps:  # what is known of progress is that of the training before
@@ -402,12 +408,5 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         return super().predict(observation, state, episode_start, deterministic)
 
     def _excluded_save_params(self) -> list[str]:
-        transient = [
-            "_searcher",
-            "_decision",
-            "_rollouts",
-            "_checked_env",
-            "_simulated_batches",
-            "_is_restored",
-        ]
+        transient = ["_searcher", "_decision", "_rollouts", "_checked_env", "_simulated_batches"]
         return [*super()._excluded_save_params(), *transient]

@@ -58,6 +58,8 @@ class SearchPolicy:
             raise TypeError(f"normalize_reward must be True, False or None, got {normalize_reward!r}.")
         self.model = model
         if preset is None and isinstance(model, MCBS):
+            if search_settings.get("rollout_depth") == 0:  # where nothing simulates, no model does
+                search_settings = {"forward_model": "auto", **search_settings}
             self.settings = replace(model.search_settings, **search_settings)
         else:
             self.settings = SearchSettings(**with_preset(preset, search_settings))

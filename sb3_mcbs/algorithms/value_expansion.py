@@ -66,6 +66,11 @@ class ValueExpansionSettings(CheckedSettings):
                 "value_expansion needs a rollout_depth of 1 or more: with 0 there is no forward model. "
                 "search_share=0 leaves the search out."
             )
+        if settings.forward_model == "ensemble":
+            raise ValueError(
+                "value_expansion goes on in the simulator, which forward_model='ensemble' does without: "
+                "leave one of the two out."
+            )
         if rollout_replay + self.expanded_share > 1:
             raise ValueError(
                 "rollout_replay and expanded_share are parts of the same batch and must not exceed 1 "
@@ -114,13 +119,17 @@ class ValueExpansion:
 
     def _states(self, envs: range) -> np.ndarray:
         searcher = self._searcher
-        states = searcher.read_roots(envs) if searcher.model is not None else []
-        if searcher.model is None or searcher.model.kind != "mujoco":
+        states = searcher.read_roots(envs) if self._is_batched else []
+        if not self._is_batched:  # the environment may just have exchanged its simulator
             raise ForwardModelError(
                 "value_expansion keeps the simulator's states in the replay buffer, which needs batched "
                 f"MuJoCo; here simulates: {searcher.description}. Leave value_expansion out."
             )
         return np.stack(states)
+
+    @property
+    def _is_batched(self) -> bool:
+        return self._searcher.model is not None and self._searcher.model.kind == "mujoco"
 
     def look(self) -> None:
         """Remember the states that the environments are in before a step, for :meth:`model_error`."""
@@ -147,6 +156,7 @@ class ValueExpansion:
         with one_thread():
             model.set_roots(list(self._before), np.arange(n_envs), self._agent.rollout_rng)
             step = model.step(self._searcher.unscale(actions))
+        self._agent.n_simulated_steps += n_envs
         self._before = None
         executed = SearchResult(
             actions=actions,

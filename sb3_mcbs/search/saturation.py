@@ -12,8 +12,10 @@ import numpy as np
 
 #: A window with fewer episodes says nothing.
 _LEAST = 2
-#: A fall is more than so many standard errors: over a long training a window is low by chance now and then.
-_FALL = 4.0
+#: Odds, as a logarithm, against what returns lack adding up by chance (Page's test).
+_ODDS = 9.0
+#: The mean of the episodes since a change counts so many standard errors lower than it is.
+_CAUTION = 2.0
 _START, _END, _TOTAL, _SEARCHED = range(4)
 
 
@@ -37,8 +39,9 @@ class Saturation:
 
     Windows end at the present step. With the full share it compares the last one with the one before; with
     the reduced share it compares the last one with the best that the mean of all episodes since the change
-    has been (the best window would be best by luck). Differences are measured in parts of all that was gained
-    since the training began, whatever the scale of rewards is.
+    has been (the best window would be best by luck), and adds up over the episodes what they lack, since one
+    window in many is low by chance. Differences are measured in parts of all that was gained since the
+    training began, whatever the scale of rewards is.
 
     :ivar is_reduced: whether the share is the reduced one.
     :ivar changes: how often that has changed.
@@ -55,6 +58,7 @@ class Saturation:
         #: Of the episodes since the change, by kind: count and mean, and the best that the mean has been.
         self._since_change: dict[bool, tuple[int, float]] = {}
         self._best: dict[bool, float] = {}
+        self._lacking = 0.0
 
     def begin(self, step: int) -> None:
         """Episodes that begin from now on are searched as the share says.
@@ -91,11 +95,8 @@ class Saturation:
         self._gain = max(self._gain, rise)
         settled = step - self._since >= 2 * window
         if self.is_reduced:
-            if settled and self._has_fallen(comparable, last, recovery * self._gain):
+            if settled and self._has_fallen(finished, comparable, last, recovery * self._gain):
                 self._change(step)
-            elif settled:
-                for kind, (_, mean) in self._since_change.items():
-                    self._best[kind] = max(mean, self._best.get(kind, mean))
         elif settled:
             change = _difference(last, _means(before))
             # A return that has never risen above its own noise is not saturated: it has yet to improve.
@@ -110,27 +111,32 @@ class Saturation:
                 mean += (episode.total - mean) / (count + 1)
                 self._since_change[episode.searched] = count + 1, mean
 
-    def _has_fallen(self, comparable: np.ndarray, last: np.ndarray, least: float) -> bool:
-        """Whether the last window is below the best by more than the least fall, and by more than chance."""
+    def _has_fallen(
+        self, finished: Sequence[Episode], comparable: np.ndarray, last: np.ndarray, least: float
+    ) -> bool:
+        """Whether returns have been lower than the best for so long that it is not chance.
+
+        :param finished: episodes that ended at this step.
+        :param comparable: ``[n, 4]``, of the last two windows.
+        :param last: ``[n, 4]``, of the last one.
+        :param least: how much lower, at least.
+        """
+        variance = _variance(comparable)
+        for kind, (count, mean) in self._since_change.items():
+            mean -= _CAUTION * (variance / count) ** 0.5
+            self._best[kind] = max(mean, self._best.get(kind, mean))
+        for episode in finished:
+            if episode.start >= (self._since or 0) and episode.searched in self._best:
+                lacks = self._best[episode.searched] - episode.total - least
+                self._lacking = max(0.0, self._lacking + lacks)
         change = _difference(last, self._best)
-        if change is None:
-            return False
-        counts = {
-            kind: np.count_nonzero(last[:, _SEARCHED] == kind) for kind in _means(last).keys() & self._best
-        }
-        variance = sum(
-            (count / sum(counts.values())) ** 2
-            * comparable[comparable[:, _SEARCHED] == kind, _TOTAL].var(ddof=1)
-            * (1 / count + 1 / self._since_change[kind][0])
-            for kind, count in counts.items()
-        )
-        return -change > max(least, _FALL * variance**0.5)
+        return change is not None and -change > least and self._lacking > 0.5 * _ODDS * variance / least
 
     def _change(self, step: int) -> None:
         self.is_reduced = not self.is_reduced
         self.changes += 1
         self._since = step
-        self._since_change, self._best = {}, {}
+        self._since_change, self._best, self._lacking = {}, {}, 0.0
 
 
 def _means(episodes: np.ndarray) -> dict[bool, float]:
@@ -140,6 +146,16 @@ def _means(episodes: np.ndarray) -> dict[bool, float]:
     """
     by_kind = {kind: episodes[episodes[:, _SEARCHED] == kind, _TOTAL] for kind in (False, True)}
     return {kind: float(totals.mean()) for kind, totals in by_kind.items() if len(totals) >= _LEAST}
+
+
+def _variance(episodes: np.ndarray) -> float:
+    """The variance of returns around the mean of their kind.
+
+    :param episodes: ``[n, 4]``, as :class:`Episode`, two or more.
+    """
+    means = _means(episodes)
+    away = [total - means.get(bool(kind), total) for total, kind in episodes[:, [_TOTAL, _SEARCHED]]]
+    return float(np.square(away).sum() / max(len(away) - len(means), 1))
 
 
 def _difference(episodes: np.ndarray, reference: dict[bool, float]) -> float | None:

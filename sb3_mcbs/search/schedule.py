@@ -36,8 +36,8 @@ class ScheduleSettings(CheckedSettings):
         within two of them after a change.
     :param saturation_tolerance: the return has stopped improving if it differs from that of the window
         before by no more than this part of all that was gained since the training began.
-    :param recovery_tolerance: returns have fallen if they are below the best since the last change by more
-        than this part of the same.
+    :param recovery_tolerance: returns have fallen if they are below the best mean since the last change by
+        more than this part of the same, and for so long that it is not chance.
     :raises TypeError: if a value has the wrong type.
     :raises ValueError: if a value is out of range, or has no meaning with the schedule.
     """

@@ -214,11 +214,6 @@ class SearchSettings(CheckedSettings):
                 "beam_width above 1 needs a beam_noise above 0, and a noise_clip above 0 if it is set: all "
                 "candidates would be the policy's own action."
             )
-        if most == 1 and self.include_policy_action and self.n_proposals is None:
-            raise ValueError(
-                "include_policy_action needs a beam_width of 2 or more: the policy's own action would be the "
-                "only candidate."
-            )
 
     def _check_refinement(self) -> None:
         if self.beam_width == 1:

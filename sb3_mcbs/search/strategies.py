@@ -62,7 +62,7 @@ def search(decision: Decision) -> SearchResult:
 
 
 def check_dynamics(settings: SearchSettings, deterministic: bool) -> None:
-    """Say which settings make no sense with an environment's dynamics.
+    """Say which settings make no sense, or none with an environment's dynamics.
 
     :param settings: of the search.
     :param deterministic: whether the environment's steps are.
@@ -72,6 +72,11 @@ def check_dynamics(settings: SearchSettings, deterministic: bool) -> None:
         raise ValueError(
             f"strategy={settings.strategy!r} needs n_simulations of 2 or more here: the environment's steps "
             "are random, and with one simulation the luckiest draw would win."
+        )
+    if (settings.strategy, settings.beam_width, settings.include_policy_action) == ("beam", 1, True):
+        logger.warning(
+            "beam_width=1 with include_policy_action leaves nothing to choose from: the policy's own action "
+            "is the only candidate."
         )
     if settings.distinct_simulations(deterministic) < settings.n_simulations:
         logger.warning(

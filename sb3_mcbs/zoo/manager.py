@@ -136,7 +136,7 @@ class MCBSExperimentManager(ExperimentManager):
         :raises optuna.TrialPruned: also where RL Zoo prunes
         """
         if self.algo in ALGORITHMS:
-            names = {name for settings in SETTINGS for name in settings.names()}
+            names = {"optimize_memory_usage", *(name for settings in SETTINGS for name in settings.names())}
             held = {name: value for name, value in self._hyperparams.items() if name in names}
             trial.set_user_attr(HELD, held)
         try:

@@ -51,10 +51,13 @@ _NO_PRESET: dict[str, Any] = {"preset": None}
 
 #: The user attribute of a trial that says what the hyperparameter file holds of the search.
 HELD = "held_settings"
-#: What the scope "strategies" replaces of those where it draws nothing.
+#: Limits stay as they are held, and so does what the machine is given.
+_LIMITS = ("noise_clip", "min_noise", "time_budget", "max_beam_width", *OF_THE_MACHINE)
+#: What the scopes "strategies" and "schedules" replace of the held settings where they draw nothing.
 _STRATEGY: dict[str, Any] = {
-    name: value for name, value in asdict(SearchSettings()).items() if name not in OF_THE_MACHINE
+    name: value for name, value in asdict(SearchSettings()).items() if name not in _LIMITS
 }
+_SCHEDULE: dict[str, Any] = dict.fromkeys(("final_search_share", "final_beam_width", "final_rollout_depth"))
 
 
 def tuning_scope() -> str:
@@ -89,14 +92,15 @@ def sample_mcbs_params(
         "rollout_depth": trial.suggest_categorical("rollout_depth", ROLLOUT_DEPTHS),
         "beam_noise": trial.suggest_float("beam_noise", *BEAM_NOISE, log=True),
     }
-    if scope == "strategies" or held.get("rollout_noise") != 0:  # else simulations have nothing to differ in
+    simulations_differ = held.get("strategy", "beam") == "beam" and held.get("rollout_noise") != 0
+    if scope == "strategies" or simulations_differ:
         sampled["n_simulations"] = trial.suggest_categorical("n_simulations", N_SIMULATIONS)
     if scope == "strategies":
         sampled |= _sample_strategy(trial, base, sampled["rollout_depth"])
     if scope == "schedules":
         sampled |= _sample_schedule(trial)
     params = _search_settings(sampled)
-    reason = _why_senseless({"n_simulations": 1, **held, **params}, sampled, n_actions)
+    reason = _why_senseless({**held, **params}, sampled, n_actions)
     if reason is not None:
         trial.set_user_attr("pruned", reason)
         raise optuna.TrialPruned(f"{reason}: {params}")
@@ -151,6 +155,8 @@ def _search_settings(sampled: dict[str, Any]) -> dict[str, Any]:
     settings = {name: value for name, value in sampled.items() if name not in _HELPERS}
     if "strategy" in sampled:
         settings = {**_STRATEGY, **settings}
+    if "search_schedule" in sampled:
+        settings = {**_SCHEDULE, **settings}
     if sampled.get("noise_free_rollouts"):
         settings["rollout_noise"] = 0.0
     if settings.get("strategy", "beam") != "beam":
@@ -164,9 +170,11 @@ def _search_settings(sampled: dict[str, Any]) -> dict[str, Any]:
 
 
 def _why_senseless(params: dict[str, Any], sampled: dict[str, Any], n_actions: int) -> str | None:
-    if params["rollout_depth"] == 0 and params["n_simulations"] > 1:
-        return "nothing is simulated at rollout_depth 0, so n_simulations above 1 repeats another trial"
     drawn = sampled.get("n_simulations", 1)
+    if params["rollout_depth"] == 0 and drawn > 1:
+        return "nothing is simulated at rollout_depth 0, so n_simulations above 1 repeats another trial"
+    if params.get("value_expansion") and params.get("optimize_memory_usage"):
+        return "value_expansion does not go with optimize_memory_usage"
     if drawn > 1 and (params["n_simulations"] == 1 or params.get("rollout_noise") == 0):
         return "n_simulations above 1 needs a beam with noise in its rollouts, else it repeats another trial"
     if (params.get("proposal_dims") or 0) >= n_actions:
