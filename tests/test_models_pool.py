@@ -1,7 +1,9 @@
 """The pool of environment copies: any environment, any wrapper, any dynamics."""
 
+import gc
 import logging
 import random
+import weakref
 from pathlib import Path
 
 import gymnasium as gym
@@ -335,3 +337,30 @@ def test_roots_of_several_environments() -> None:
     with pytest.raises(ValueError, match="one action for each of 2 rows, got 3"):
         model.set_roots(roots, np.arange(2), RNG)
         model.step(actions)
+
+
+def test_copies_go_with_their_pool(monkeypatch: pytest.MonkeyPatch) -> None:
+    closed = []
+    monkeypatch.setattr(PointEnv, "close", lambda env: closed.append(env))
+    env = point()
+    kept, forgotten = (EnvPoolModel(LocalEnvironments([env])) for _ in range(2))
+    for model in (kept, forgotten):
+        start(model, 3)
+    closed.clear()
+    del model, forgotten
+    gc.collect()
+    assert len(closed) == 3 and env.unwrapped not in closed
+    assert kept.step(small_actions(3)).valid.all()
+    env.step(small_actions(1)[0])
+    kept.close()
+    assert len(closed) == 6
+
+
+def test_a_pool_is_not_kept_by_its_environment() -> None:
+    env = point()
+    model = EnvPoolModel(LocalEnvironments([env]))
+    env.planner = model
+    gone = weakref.ref(model), weakref.ref(env)
+    del env, model
+    gc.collect()
+    assert [what() for what in gone] == [None, None]

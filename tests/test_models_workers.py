@@ -1,21 +1,26 @@
 """Environments in worker processes are simulated as those of this process are."""
 
+import gc
 from collections.abc import Iterator
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.wrappers import RescaleAction
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from sb3_mcbs.models import (
+    EnvPoolModel,
     ForwardModelError,
     LocalEnvironments,
     WorkerEnvironments,
     WorkerError,
     make_forward_model,
 )
+from sb3_mcbs.models.copies import _COPIES
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 
 
@@ -36,6 +41,10 @@ def fail(wrapper: SnapshotEnvWrapper, how: str) -> Any:
 
 def describe(wrapper: SnapshotEnvWrapper, *args: Any) -> tuple:
     return (type(wrapper).__name__, *args)
+
+
+def count_pools(wrapper: SnapshotEnvWrapper) -> int:
+    return len(_COPIES.get(wrapper, {}))
 
 
 @pytest.fixture(scope="module")
@@ -132,6 +141,47 @@ def test_an_environment_without_the_wrapper_is_refused() -> None:
     vec_env.close()
     with pytest.raises(ForwardModelError, match="expected a SubprocVecEnv, got DummyVecEnv"):
         WorkerEnvironments(DummyVecEnv([lambda: gym.make("Pendulum-v1")]))
+
+
+def test_a_wrapper_that_is_not_outermost_is_refused() -> None:
+    def half_as_strong(env: gym.Env) -> gym.Env:
+        return RescaleAction(env, np.float32(-1), np.float32(1))
+
+    def pendulum() -> gym.Env:
+        return gym.make("Pendulum-v1")
+
+    makers = [
+        lambda: SnapshotEnvWrapper(Monitor(half_as_strong(SnapshotEnvWrapper(pendulum())))),
+        lambda: half_as_strong(SnapshotEnvWrapper(pendulum())),
+        lambda: half_as_strong(pendulum()),
+        lambda: Monitor(SnapshotEnvWrapper(half_as_strong(pendulum()))),
+    ]
+    vec_env = SubprocVecEnv(makers, start_method="fork")
+    outside = r"environments \[1, 3\] have Monitor, RescaleAction outside of their SnapshotEnvWrapper"
+    with pytest.raises(ForwardModelError, match=rf"\[2\] were made without .* and {outside}"):
+        WorkerEnvironments(vec_env)
+    vec_env.reset()  # the workers live on
+    vec_env.close()
+    vec_env = SubprocVecEnv(makers[:1], start_method="fork")
+    assert WorkerEnvironments(vec_env).apply([0], describe) == [("SnapshotEnvWrapper",)]
+    vec_env.close()
+
+
+def test_copies_in_workers_go_after_their_pool_has_gone(workers: SubprocVecEnv) -> None:
+    workers.reset()
+    environments = WorkerEnvironments(workers)
+    kept = EnvPoolModel(environments)
+    before = environments.apply([0, 1], count_pools)
+    forgotten = EnvPoolModel(WorkerEnvironments(workers))
+    # Workers that are stepping cannot be told.
+    workers.step_async(np.zeros((2, 6), dtype=np.float32))
+    del forgotten
+    gc.collect()
+    workers.step_wait()
+    assert environments.apply([0, 1], count_pools) == before
+    kept.set_roots(kept.read_roots([0]), np.zeros(2, dtype=int), np.random.default_rng())
+    assert kept.step(np.zeros((2, 6), dtype=np.float32)).valid.all()
+    kept.close()
 
 
 def test_a_worker_that_has_ended_is_reported() -> None:

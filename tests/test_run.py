@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv
+from gymnasium.wrappers import TransformReward
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, CheckpointCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
@@ -97,6 +98,21 @@ def test_workers_that_are_not_wrapped_are_refused(make_agent):
     env = make_vec_env("Pendulum-v1", 1, vec_env_cls=SubprocVecEnv)
     with pytest.raises(ValueError, match=r"env_wrapper: sb3_mcbs\.SnapshotEnvWrapper"):
         make_agent(env)
+    env.close()
+
+
+def test_workers_whose_wrapper_is_not_outermost_are_refused(make_agent):
+    """A look-ahead from inside would know neither these actions nor these rewards."""
+
+    def wrap(env):
+        return TransformReward(SnapshotEnvWrapper(env), lambda reward: -reward)
+
+    env = make_vec_env("Pendulum-v1", 2, vec_env_cls=SubprocVecEnv, wrapper_class=wrap)
+    with pytest.raises(
+        ValueError, match=r"\[0, 1\] have TransformReward outside of their SnapshotEnvWrapper"
+    ):
+        make_agent(env)
+    assert make_agent(env, rollout_depth=0).learn(24).n_decisions == 4  # nothing is simulated
     env.close()
 
 

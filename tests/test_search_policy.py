@@ -1,5 +1,7 @@
 """Acting with search with any trained agent."""
 
+import gc
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize, sync_envs_normalization
 
 from sb3_mcbs import MCBSTD3, SearchPolicy, SearchSettings, SnapshotEnvWrapper
+from sb3_mcbs.models.copies import _COPIES
 from tests.conftest import SEARCHING, SMALL_SEARCH, snapshot_vec_env
 
 
@@ -181,6 +184,16 @@ def test_search_leaves_the_environment_alone(make_agent):
     for left, right in zip(plain, again, strict=True):
         np.testing.assert_array_equal(left[0], right[0])
         np.testing.assert_array_equal(left[1], right[1])
+
+
+def test_forgotten_policies_leave_nothing_in_the_environment(make_agent):
+    env, agent = make_vec_env("Pendulum-v1", 1), make_agent()
+    for _ in range(2):
+        policy = SearchPolicy(agent, env, seed=0)
+        policy.predict(env.reset())
+        del policy
+        gc.collect()
+        assert not _COPIES.get(env.envs[0])
 
 
 class TestRewardScale:

@@ -196,7 +196,7 @@ def snapshot_environments(vec_env: VecEnv) -> Environments:
 
     :param vec_env: the innermost vectorized environment.
     :return: access to the environments where they live.
-    :raises ValueError: if the environments of worker processes are not wrapped.
+    :raises ValueError: if the environments of worker processes are not wrapped outermost.
     :raises TypeError: if the vectorized environment is of another kind.
     """
     if isinstance(vec_env, DummyVecEnv):
@@ -204,13 +204,6 @@ def snapshot_environments(vec_env: VecEnv) -> Environments:
         vec_env.envs[:] = wrapped
         return LocalEnvironments(wrapped)
     if isinstance(vec_env, SubprocVecEnv):
-        if not all(vec_env.env_is_wrapped(SnapshotEnvWrapper)):
-            raise ValueError(
-                "The environments of a SubprocVecEnv live in worker processes and cannot be wrapped "
-                "afterwards. Wrap them when they are made: make_vec_env(..., "
-                "wrapper_class=SnapshotEnvWrapper), or in an RL Zoo hyperparameter file the line\n"
-                "  env_wrapper: sb3_mcbs.SnapshotEnvWrapper"
-            )
         return WorkerEnvironments(vec_env)
     raise TypeError(f"Look-ahead needs a DummyVecEnv or a SubprocVecEnv, got {type(vec_env).__name__}.")
 

@@ -212,9 +212,10 @@ def step_rows(wrapper: SnapshotEnvWrapper, pool: str, actions: np.ndarray) -> An
 
 
 def drop_copies(wrapper: SnapshotEnvWrapper, pool: str) -> None:
-    """Close the copies that a pool keeps of an environment."""
-    copies_of(wrapper, pool).close()
-    del _COPIES[wrapper][pool]
+    """Close the copies that a pool keeps of an environment, if it has any."""
+    copies = _COPIES.get(wrapper, {}).pop(pool, None)
+    if copies is not None:
+        copies.close()
 
 
 def read_snapshot(wrapper: SnapshotEnvWrapper) -> Snapshot:

@@ -5,6 +5,7 @@ import traceback
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any
+from weakref import WeakKeyDictionary, finalize, ref
 
 import cloudpickle
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
@@ -12,6 +13,15 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 from sb3_mcbs.models.base import ForwardModelError
 from sb3_mcbs.models.workers import await_answers, collect_tracebacks, worker_error
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
+
+_Call = tuple[Callable[..., Any], tuple[Any, ...]]
+
+# What workers have to do for objects of this process that are gone, once they are free to do it.
+_OVERDUE: WeakKeyDictionary[SubprocVecEnv, list[_Call]] = WeakKeyDictionary()
+
+
+class WrappingError(ForwardModelError, ValueError):
+    """Environments of worker processes do not have a ``SnapshotEnvWrapper`` outermost."""
 
 
 class Environments(ABC):
@@ -45,6 +55,16 @@ class Environments(ABC):
         """
         return self.apply_each(env_indices, function, [args] * len(env_indices))
 
+    @abstractmethod
+    def when_gone(self, owner: object, function: Callable[..., Any], *args: Any) -> None:
+        """Run a function next to every environment that is left when an object has been collected.
+
+        :param owner: the object. Neither it nor the environments live longer for this.
+        :param function: called as ``function(wrapper, *args)``; in worker processes not before the next
+            call that is for them.
+        :param args: further arguments.
+        """
+
 
 class LocalEnvironments(Environments):
     """Environments of this process.
@@ -69,13 +89,17 @@ class LocalEnvironments(Environments):
         wrappers = self.wrappers
         return [function(wrappers[i], *args) for i, args in zip(env_indices, args_per_env, strict=True)]
 
+    def when_gone(self, owner: object, function: Callable[..., Any], *args: Any) -> None:
+        wrappers = [ref(wrapper) for wrapper in self.wrappers]
+        finalize(owner, _call_alive, wrappers, function, args).atexit = False
+
 
 class WorkerEnvironments(Environments):
     """Environments in the worker processes of a ``SubprocVecEnv``, which work at the same time.
 
     :param vec_env: the ``SubprocVecEnv``, or a wrapper around one. Each environment must have been
-        wrapped in a :class:`~sb3_mcbs.snapshot.SnapshotEnvWrapper` when its worker made it.
-    :raises ForwardModelError: if one was not.
+        wrapped in a :class:`~sb3_mcbs.snapshot.SnapshotEnvWrapper`, outermost, when its worker made it.
+    :raises WrappingError: if one was not.
     """
 
     def __init__(self, vec_env: VecEnv) -> None:
@@ -83,16 +107,9 @@ class WorkerEnvironments(Environments):
         if not isinstance(inner, SubprocVecEnv):
             raise ForwardModelError(f"expected a SubprocVecEnv, got {type(inner).__name__}")
         self._check_available(inner)
-        wrapped = inner.env_is_wrapped(SnapshotEnvWrapper)
-        if not all(wrapped):
-            missing = [i for i, there in enumerate(wrapped) if not there]
-            raise ForwardModelError(
-                f"the worker processes of environments {missing} made them without a SnapshotEnvWrapper, "
-                "and it cannot be added afterwards; with RL Zoo add the line "
-                "'env_wrapper: sb3_mcbs.SnapshotEnvWrapper' to the hyperparameters, otherwise pass "
-                "wrapper_class=SnapshotEnvWrapper to make_vec_env"
-            )
+        _check_wrapping(inner)
         self.vec_env = inner
+        self._overdue = _OVERDUE.setdefault(inner, [])
         collect_tracebacks(inner)
 
     def __len__(self) -> int:
@@ -102,6 +119,18 @@ class WorkerEnvironments(Environments):
         self, env_indices: Sequence[int], function: Callable[..., Any], args_per_env: Sequence[Sequence[Any]]
     ) -> list[Any]:
         self._check_available(self.vec_env)
+        while self._overdue:
+            overdue, its_args = self._overdue.pop()
+            self._call(range(len(self)), overdue, [its_args] * len(self))
+        return self._call(env_indices, function, args_per_env)
+
+    def when_gone(self, owner: object, function: Callable[..., Any], *args: Any) -> None:
+        # Only noted: an object may be collected in the middle of a step, or of another call.
+        finalize(owner, self._overdue.append, (function, args)).atexit = False
+
+    def _call(
+        self, env_indices: Sequence[int], function: Callable[..., Any], args_per_env: Sequence[Sequence[Any]]
+    ) -> list[Any]:
         remotes = [self.vec_env.remotes[i] for i in env_indices]
         # Packed here: what a worker cannot unpack would otherwise end the worker without a word.
         calls = [cloudpickle.dumps((function, tuple(args))) for args in args_per_env]
@@ -133,6 +162,60 @@ class WorkerEnvironments(Environments):
         if error is not None:
             raise error from RuntimeError(f"in the worker process of environment {env_index}:\n{trace}")
         return result
+
+
+class _OutermostIs:
+    """Stands in for a class in ``env_is_wrapped``, to ask for the outermost wrapper only.
+
+    A worker asks ``isinstance(layer, ...)`` of one layer after the other, outermost first.
+
+    :param cls: the class.
+    """
+
+    def __init__(self, cls: type) -> None:
+        self._cls = cls
+        self._asked = False
+
+    def __instancecheck__(self, layer: object) -> bool:
+        first, self._asked = not self._asked, True
+        return first and isinstance(layer, self._cls)
+
+
+def _check_wrapping(vec_env: SubprocVecEnv) -> None:
+    outermost: Any = _OutermostIs(SnapshotEnvWrapper)
+    wrong = [i for i, right in enumerate(vec_env.env_is_wrapped(outermost)) if not right]
+    if not wrong:
+        return
+    somewhere = vec_env.env_is_wrapped(SnapshotEnvWrapper, wrong)
+    # Only those that have a wrapper can be asked for its name; the question would end the other workers.
+    others = [i for i, there in zip(wrong, somewhere, strict=True) if there]
+    outer = dict(zip(others, vec_env.env_method("class_name", indices=others), strict=True))
+    problems = []
+    if len(outer) < len(wrong):
+        missing = [i for i in wrong if i not in outer]
+        problems.append(f"environments {missing} were made without a SnapshotEnvWrapper")
+    if outer:
+        problems.append(
+            f"environments {list(outer)} have {', '.join(sorted(set(outer.values())))} outside of their "
+            "SnapshotEnvWrapper, where a snapshot cannot see what it does"
+        )
+    raise WrappingError(
+        f"{' and '.join(problems)}. The environments of a SubprocVecEnv live in worker processes and cannot "
+        "be wrapped afterwards. Make them with the SnapshotEnvWrapper outermost, outside of Monitor too: "
+        "make_vec_env(..., wrapper_class=SnapshotEnvWrapper), SubprocVecEnv([lambda: "
+        "SnapshotEnvWrapper(<all other wrappers>)]), or in an RL Zoo hyperparameter file the line\n"
+        "  env_wrapper: sb3_mcbs.SnapshotEnvWrapper\n"
+        "(as the last of a list, if there are other wrappers)"
+    )
+
+
+def _call_alive(
+    wrappers: Sequence["ref[SnapshotEnvWrapper]"], function: Callable[..., Any], args: tuple[Any, ...]
+) -> None:
+    for alive in wrappers:
+        wrapper = alive()
+        if wrapper is not None:
+            function(wrapper, *args)
 
 
 def _run_call(wrapper: SnapshotEnvWrapper, call: bytes) -> bytes:

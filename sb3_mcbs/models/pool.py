@@ -36,7 +36,8 @@ class EnvPoolModel(ForwardModel):
 
     Copies live where their environment lives: with a ``SubprocVecEnv`` the workers simulate, at the
     same time. A row that terminated or became invalid is not stepped further: it keeps its last
-    observation and ``terminated``, and its reward is 0.
+    observation and ``terminated``, and its reward is 0. The copies go when the pool is closed or
+    collected; those of workers then stay until the next look-ahead.
 
     :param environments: the real environments.
 
@@ -53,6 +54,7 @@ class EnvPoolModel(ForwardModel):
         #: Which environments have rows, and how many.
         self._counts: dict[int, int] = {}
         self._warned = False
+        environments.when_gone(self, drop_copies, self._name)
         self.refresh()
         kind = "deterministic" if self.deterministic else "random"
         self.description = f"pool of environment copies ({kind} dynamics)"

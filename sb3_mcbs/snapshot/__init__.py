@@ -3,10 +3,10 @@
 from sb3_mcbs.snapshot.errors import SnapshotError, SnapshotMismatchError, SnapshotUnsupportedError
 from sb3_mcbs.snapshot.faults import SIMULATION_DIVERGED
 from sb3_mcbs.snapshot.registry import SnapshotAdapter, register_adapter
-from sb3_mcbs.snapshot.replay import ReplayAdapter, renew_world, uses_box2d
+from sb3_mcbs.snapshot.replay import Box2DAdapter, ReplayAdapter, renew_world, uses_box2d
 from sb3_mcbs.snapshot.wrapper import Snapshot, SnapshotEnvWrapper
 
-register_adapter(uses_box2d, ReplayAdapter(prepare=renew_world))
+register_adapter(uses_box2d, Box2DAdapter(prepare=renew_world))
 try:
     from sb3_mcbs.snapshot.mujoco import MjDataAdapter, MjModelAdapter, is_data, is_model
 except ImportError:  # MuJoCo is an optional part of Gymnasium

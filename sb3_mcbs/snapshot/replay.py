@@ -7,6 +7,9 @@ import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import gymnasium as gym
+from gymnasium.envs.registration import load_env_creator
+
 from sb3_mcbs.snapshot.attributes import freeze_attributes, thaw_attributes
 from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
 from sb3_mcbs.snapshot.graph import Freezer, Node, Ref, Thawer, private_copy
@@ -146,7 +149,11 @@ class ReplayAdapter(SnapshotAdapter):
 
     def capture(self, obj: Any) -> Episode | None:
         recorder = _recorder(obj)
-        assert recorder is not None, "attach() comes before capture()"
+        if recorder is None:
+            raise SnapshotUnsupportedError(
+                f"a {type(obj).__name__} is restored by replay, which is possible only where it is the "
+                "environment itself"
+            )
         if recorder.episode is None:
             return None
         return recorder.episode._replace(actions=tuple(recorder.actions))
@@ -162,7 +169,8 @@ class ReplayAdapter(SnapshotAdapter):
         self._tell(obj, len(state.actions), time.perf_counter() - start)
 
     def clone(self, obj: Any, copy: Callable[[Any], Any]) -> Any:
-        made = type(obj)(**_constructor_arguments(obj))
+        arguments = _constructor_arguments(obj)
+        made = type(obj)(*arguments.args, **arguments.kwargs)
         made.spec = obj.spec
         made.render_mode = None
         return made
@@ -183,48 +191,81 @@ def _recorder(env: Any) -> Recorder | None:
     return vars(env).get(_RECORDER)
 
 
-def _constructor_arguments(env: Any) -> dict[str, Any]:
+def _constructor_arguments(env: Any) -> inspect.BoundArguments:
     """Find the arguments that make another environment like this one, which draws nothing.
 
     :raises SnapshotUnsupportedError: if they cannot be found out.
     """
-    parameters = inspect.signature(type(env)).parameters
-    if hasattr(env, "_ezpickle_args"):
-        bound = inspect.signature(type(env)).bind(*env._ezpickle_args, **env._ezpickle_kwargs)
-        arguments: dict[str, Any] = {}
-        for name, value in bound.arguments.items():
-            if parameters[name].kind is inspect.Parameter.VAR_KEYWORD:
-                arguments.update(value)
-            elif parameters[name].kind is not inspect.Parameter.VAR_POSITIONAL:
-                arguments[name] = value
-    elif env.spec is not None:
-        arguments = dict(env.spec.kwargs)
-    else:
-        arguments = {}
-        missing = [
-            p.name
-            for p in parameters.values()
-            if p.default is p.empty and p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)
-        ]
-        if missing:
-            raise SnapshotUnsupportedError(
-                f"{type(env).__name__} is restored by replay, and for clones its constructor's arguments "
-                f"{missing} must be known. Derive it from gymnasium.utils.EzPickle or use gymnasium.make."
-            )
-    if "render_mode" in arguments:
-        arguments["render_mode"] = None
-    return arguments
+    signature = inspect.signature(type(env))
+    try:
+        bound = _bind(env, signature)
+    except TypeError as error:
+        raise _unknown_arguments(env, str(error)) from error
+    for name, value in bound.arguments.items():
+        if name == "render_mode":
+            bound.arguments[name] = None
+        elif signature.parameters[name].kind is inspect.Parameter.VAR_KEYWORD and "render_mode" in value:
+            bound.arguments[name] = {**value, "render_mode": None}
+    return bound
+
+
+def _bind(env: Any, signature: inspect.Signature) -> inspect.BoundArguments:
+    """Find the arguments that an environment was made with.
+
+    :raises TypeError: if what is known does not fit its constructor.
+    """
+    kept = hasattr(env, "_ezpickle_args")
+    if kept and _keeps_own_arguments(type(env)):
+        return signature.bind(*env._ezpickle_args, **env._ezpickle_kwargs)
+    if env.spec is not None and (not kept or _maker(env.spec.entry_point) is type(env)):
+        return signature.bind(**env.spec.kwargs)
+    if kept and signature.parameters.keys() - {"render_mode"}:
+        raise TypeError(f"those that EzPickle kept are a base class's, not those of {signature}")
+    return signature.bind()
+
+
+def _keeps_own_arguments(cls: type) -> bool:
+    """Return whether what ``EzPickle`` keeps are the arguments of a class's own constructor.
+
+    A constructor that leaves this to that of a base class may give it other arguments than it got.
+
+    :param cls: a class that derives from ``EzPickle``.
+    """
+    own, *others = [base for base in cls.__mro__ if "__init__" in vars(base)]
+    if gym.utils.EzPickle in (own, *others[:1]):
+        return True
+    code = getattr(inspect.unwrap(own.__init__), "__code__", None)  # type: ignore[misc]
+    return code is not None and gym.utils.EzPickle.__name__ in code.co_names
+
+
+def _maker(entry_point: Any) -> Any:
+    return entry_point if callable(entry_point) else load_env_creator(entry_point)
+
+
+def _unknown_arguments(env: Any, reason: str) -> SnapshotUnsupportedError:
+    name = type(env).__name__
+    return SnapshotUnsupportedError(
+        f"{name} is restored by replay, and for clones the arguments of its constructor must be known: "
+        f"{reason}. Register {name} and use gymnasium.make, or derive it from gymnasium.utils.EzPickle and "
+        "end its __init__ with EzPickle.__init__(self, <the same arguments>)."
+    )
+
+
+class Box2DAdapter(ReplayAdapter):
+    """Replays environments that hold a Box2D world."""
+
+    # CarRacing shares the colours in it with the world's bodies, which only the replay can share again.
+    not_state = ReplayAdapter.not_state | {"road_poly"}
 
 
 def uses_box2d(env: Any) -> bool:
-    """Return whether an environment holds a Box2D world.
+    """Return whether an object is an environment that holds a Box2D world.
 
-    :param env: an environment, or an object that one holds.
+    :param env: an environment, a wrapper, or an object that one holds.
     """
-    values = getattr(env, "__dict__", {}).values()
-    return hasattr(env, "step") and any(
-        type(value).__module__.partition(".")[0] == "Box2D" for value in values
-    )
+    if not isinstance(env, gym.Env) or isinstance(env, gym.Wrapper):
+        return False
+    return any(type(value).__module__.partition(".")[0] == "Box2D" for value in vars(env).values())
 
 
 def renew_world(env: Any) -> None:
