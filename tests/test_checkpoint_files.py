@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from stable_baselines3 import DDPG
 
-from sb3_mcbs import CheckpointError, resume
+from sb3_mcbs import CheckpointError, ExactCheckpointCallback, resume
 from sb3_mcbs.checkpoints import register_state, store
 from sb3_mcbs.checkpoints.encoding import Decoder, Encoder
 from sb3_mcbs.checkpoints.store import Store
 from sb3_mcbs.snapshot import SnapshotUnsupportedError
-from tests.checkpoint_helpers import assert_same_parameters, crash, learn
+from tests.checkpoint_helpers import CrashAt, assert_same_parameters, crash, learn
 from tests.test_checkpoints import maker
 
 MAKE = maker(DDPG, buffer_size=1000, policy_kwargs=dict(net_arch=[8]))
@@ -129,6 +129,60 @@ def test_a_full_disk_stops_nothing(code, fails_at, tmp_path, monkeypatch, lost_r
     assert Store(tmp_path / "checkpoints").steps() == [160, 120]
     assert not list((tmp_path / "checkpoints").rglob(".unfinished*"))
     Store(tmp_path / "checkpoints").read(160)
+
+
+def test_a_folder_that_has_vanished_is_made_again(tmp_path, lost_run):
+    class Remove(CrashAt):
+        """Here it is the folder that is lost, not the run."""
+
+        def _on_step(self):
+            if self.num_timesteps == 100 and not resumed:
+                shutil.rmtree(tmp_path / "checkpoints")
+            return True
+
+    resumed = None
+    MAKE(tmp_path).learn(200, callback=[ExactCheckpointCallback(40, tmp_path / "checkpoints"), Remove()])
+    assert Store(tmp_path / "checkpoints").steps() == [160, 120]
+    resumed = resume(tmp_path / "checkpoints")
+    resumed.learn(200, callback=[ExactCheckpointCallback(40, tmp_path / "checkpoints"), Remove()])
+    assert_same_parameters(resumed, lost_run[1])
+
+
+def test_a_failure_says_what_to_do(tmp_path, monkeypatch):
+    def no_room(*args):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(Store, "write", no_room)
+    message = "at 40 steps: .*No space left.*the next one is due at 80 steps.*Make room on the disk"
+    with pytest.warns(UserWarning, match=message):
+        learn(MAKE(tmp_path), tmp_path, 50)
+
+
+def test_a_later_damaged_checkpoint_does_not_take_the_place_of_a_new_one(folder):
+    """A run that goes on from 80 steps, since the checkpoint at 120 is damaged, may be stopped at 100."""
+    checkpoints = Store(folder / "checkpoints")
+    truncate(checkpoints.path_of(120) / "state.json")
+    shutil.copytree(checkpoints.path_of(80), checkpoints.path_of(100))
+    checkpoints.clean(1, newest=100)
+    assert checkpoints.steps() == [120, 100]
+    checkpoints.read(100)
+
+
+def test_a_run_may_go_on_in_another_folder(folder, lost_run):
+    agent = resume(folder / "checkpoints")
+    agent.learn(200, callback=[ExactCheckpointCallback(40, folder / "other"), CrashAt()])
+    assert Store(folder / "checkpoints").steps() == [120, 80]
+    shutil.rmtree(folder / "checkpoints")
+    resumed = resume(folder / "other")
+    resumed.learn(200, callback=[ExactCheckpointCallback(40, folder / "other"), CrashAt()])
+    assert_same_parameters(resumed, lost_run[1])
+
+
+def test_the_other_folder_may_not_be_that_of_another_run(folder, tmp_path_factory):
+    other = tmp_path_factory.mktemp("other")
+    shutil.copytree(folder / "checkpoints", other / "checkpoints")
+    with pytest.raises(CheckpointError, match="holds the checkpoints of a run"):
+        learn(resume(folder / "checkpoints"), other, 200)
 
 
 def test_disk_use_stays_below_twice_the_buffer(tmp_path):

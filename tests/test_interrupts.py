@@ -8,10 +8,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from stable_baselines3 import DDPG
+from stable_baselines3.common.callbacks import BaseCallback
 
 from benchmarks.kill import differences, kill_once, run_killed, start, wait_until
 from benchmarks.kill_run import RESULT, STARTED
+from sb3_mcbs import ExactCheckpointCallback, resume
+from sb3_mcbs.checkpoints import TrainingInterrupted
 from sb3_mcbs.checkpoints.store import Store
+from tests.checkpoint_helpers import assert_same_runs, learn
+from tests.test_checkpoints import maker
 
 WORKERS = "Pendulum-v1 in workers"
 ENDLESS = 1_000_000
@@ -65,6 +71,64 @@ def test_a_second_signal_stops_at_once(tmp_path):
     os.kill(process.pid, signal.SIGINT)
     assert process.wait(20) != 130
     assert "KeyboardInterrupt" in (tmp_path / "output.txt").read_text()
+
+
+class SignalAt(BaseCallback):
+    """Sends this process a signal in the middle of a step, and may end training in that step."""
+
+    not_checkpointed = ("step", "ends")
+
+    def __init__(self, step: int | None, ends: bool = False) -> None:
+        super().__init__()
+        self.step = step
+        self.ends = ends
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps != self.step:
+            return True
+        os.kill(os.getpid(), signal.SIGTERM)
+        return not self.ends
+
+
+MAKE = maker(DDPG, buffer_size=1000, policy_kwargs=dict(net_arch=[8]))
+
+
+@pytest.fixture(autouse=True)
+def handlers_are_given_back():
+    before = [signal.getsignal(signum) for signum in (signal.SIGINT, signal.SIGTERM)]
+    yield
+    assert [signal.getsignal(signum) for signum in (signal.SIGINT, signal.SIGTERM)] == before
+
+
+def test_a_signal_in_the_last_rollout_saves_and_stops(tmp_path, capsys):
+    whole = learn(MAKE(tmp_path / "whole"), tmp_path / "whole", 100, more=[SignalAt(None)])
+    with pytest.raises(TrainingInterrupted) as stopped:
+        learn(MAKE(tmp_path / "stopped"), tmp_path / "stopped", 100, more=[SignalAt(100)])
+    assert stopped.value.code == 143
+    assert "Stopped by SIGTERM at 100 steps" in capsys.readouterr().err
+    checkpoints = tmp_path / "stopped" / "checkpoints"
+    assert Store(checkpoints).steps() == [100, 80]
+    assert (checkpoints / "interrupted.json").exists()
+    second = SignalAt(None)
+    resumed = learn(resume(checkpoints), tmp_path / "stopped", 100, more=[second])
+    assert_same_runs(whole, resumed)
+    assert second.n_calls == 100
+    assert not (checkpoints / "interrupted.json").exists()
+
+
+def test_a_signal_when_a_callback_ends_training_stops_too(tmp_path):
+    """There is nothing to save: the state in the middle of a rollout is none to go on from."""
+    with pytest.raises(TrainingInterrupted):
+        learn(MAKE(tmp_path), tmp_path, 100, more=[SignalAt(90, ends=True)])
+    assert Store(tmp_path / "checkpoints").steps() == [80, 40]
+
+
+def test_learn_may_be_called_again_after_a_signal(tmp_path):
+    agent, callback = MAKE(tmp_path), ExactCheckpointCallback(40, tmp_path / "checkpoints")
+    with pytest.raises(TrainingInterrupted):
+        agent.learn(100, callback=[callback, SignalAt(50)])
+    agent.learn(50, callback=callback, reset_num_timesteps=False)
+    assert agent.num_timesteps == 100
 
 
 @pytest.mark.parametrize(

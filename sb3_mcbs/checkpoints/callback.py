@@ -95,7 +95,7 @@ class ExactCheckpointCallback(BaseCallback):
         self.store = Store(self.path)
         newest = max(self.store.steps(), default=None)
         goes_on = self._begun and newest is not None and newest <= self.model.num_timesteps
-        if newest is not None and pending(self.model) is None and not goes_on:
+        if newest is not None and not self._is_resumed_here() and not goes_on:
             raise CheckpointError(
                 f"{self.path} holds the checkpoints of a run. Continue it with sb3_mcbs.resume, or choose "
                 "another folder."
@@ -108,8 +108,13 @@ class ExactCheckpointCallback(BaseCallback):
                 "a rollout starts. Pass it to learn() itself, in a list with the others."
             )
 
+    def _is_resumed_here(self) -> bool:
+        resumption = pending(self.model)
+        return resumption is not None and resumption.store.folder.resolve() == self.store.folder.resolve()
+
     def _on_training_start(self) -> None:
         self._check_place()
+        self._run = None  # there still if the last call of learn() was stopped
 
     def _on_rollout_start(self) -> None:
         assert isinstance(self.model, OffPolicyAlgorithm)
@@ -119,7 +124,7 @@ class ExactCheckpointCallback(BaseCallback):
         stopped_by = self._interrupts.received
         if self.num_timesteps >= self._next_save or stopped_by is not None:
             self._next_save = (self.num_timesteps // self.save_freq + 1) * self.save_freq
-            self._save_or_warn(first=not self.store.steps())
+            self._save_or_warn()
         if stopped_by is not None:
             self._stop(stopped_by)
 
@@ -127,6 +132,16 @@ class ExactCheckpointCallback(BaseCallback):
         return True
 
     def _on_training_end(self) -> None:
+        assert isinstance(self.model, OffPolicyAlgorithm)
+        if pending(self.model) is not None:
+            self._begin(self.model)
+        stopped_by = self._interrupts.received
+        if self._run is not None and stopped_by is not None:
+            # A run that a callback ended stops there again from the checkpoint before.
+            if self.num_timesteps >= self.model._total_timesteps:
+                self._count_rows()
+                self._save_or_warn()
+            self._stop(stopped_by)
         self._interrupts.end()
         self._run = None
 
@@ -141,8 +156,10 @@ class ExactCheckpointCallback(BaseCallback):
         self._n_calls_then, self._next_save, self._parts = self.n_calls, self.num_timesteps, []
         resumption: Resumption | None = pending(agent)
         if resumption is not None:
+            resumed_here = self._is_resumed_here()
             resumption.carry_out(agent, self._run, self._settings)
-            self._parts = resumption.checkpoint.manifest["rows"]
+            if resumed_here:
+                self._parts = resumption.checkpoint.manifest["rows"]
             (self.store.folder / MARK).unlink(missing_ok=True)
         self._interrupts.begin(self._run.worker_environments)
 
@@ -152,15 +169,20 @@ class ExactCheckpointCallback(BaseCallback):
         self._rows_added += added_rows(buffer, self._position, steps)
         self._position, self._n_calls_then = buffer.pos, self.n_calls
 
-    def _save_or_warn(self, first: bool) -> None:
+    def _save_or_warn(self) -> None:
+        first = not self.store.steps()
         try:
             self._save()
         except (OSError, CheckpointError, SnapshotUnsupportedError) as error:
             if first and not isinstance(error, OSError):
                 raise  # better known before training than in the middle of it
+            outlook = f"Training goes on; the next one is due at {self._next_save} steps."
+            if isinstance(error, OSError):
+                outlook += " Make room on the disk, or make the folder writable, before that."
             message = (
-                f"No checkpoint could be written at {self.num_timesteps} steps: {error}. Training goes on; "
-                f"the last one in {self.path} is kept."
+                f"No checkpoint could be written at {self.num_timesteps} steps: {str(error).rstrip('.')}. "
+                f"{outlook if self._interrupts.received is None else 'Training stops.'} "
+                f"What {self.path} holds is kept."
             )
             logger.warning(message)
             warnings.warn(message, stacklevel=2)
@@ -173,6 +195,8 @@ class ExactCheckpointCallback(BaseCallback):
         buffer = agent.replay_buffer
         oldest = self._rows_added - rows_held(buffer)
         parts = [part for part in self._parts if part["end"] >= oldest and part["end"] <= self._rows_added]
+        if not all(self.store.has_rows(part) for part in parts):
+            parts = []  # somebody has removed them
         first = max([oldest, *(part["end"] for part in parts)])
         if first < self._rows_added:
             rows = read_rows(buffer, first, self._rows_added)
@@ -181,7 +205,7 @@ class ExactCheckpointCallback(BaseCallback):
         arrays = {**captured.arrays, **in_section(SETTINGS, self._settings.arrays)}
         self.store.write(self.num_timesteps, manifest, captured.json, arrays)
         self._parts = parts
-        self.store.clean(self.keep_last)
+        self.store.clean(self.keep_last, self.num_timesteps)
         if self.verbose >= 1:
             print(f"Exact checkpoint at {self.num_timesteps} steps in {self.path}")
 

@@ -1,12 +1,14 @@
 """What a run consists of, and which of its attributes are not state, each with the reason."""
 
-from collections.abc import Iterator
+import os
+import re
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
-from stable_baselines3.common.logger import KVWriter
+from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvWrapper
@@ -19,6 +21,8 @@ _HOOKS = "functions that somebody attached to the network"
 _RESOURCE = "made anew in a new process"
 _OUTPUT = "what the last step returned; written again before it is read"
 _FILE = "an open file; its content is saved"
+#: The end of a word in the names of attributes that say where something is written.
+_PLACE = re.compile(r"(path|dir|directory|folder|file|filename|prefix)(_|$)")
 
 #: Class (and those derived from it) -> attribute -> why it is neither saved nor restored.
 NOT_STATE: dict[type, dict[str, str]] = {
@@ -33,6 +37,7 @@ NOT_STATE: dict[type, dict[str, str]] = {
         "_resumption": "only there until a run was resumed",
         "_setup_learn": "only replaced until a run was resumed",
         "_excluded_save_params": "only replaced until a run was resumed",
+        "tensorboard_log": "a setting, which was checked when the run was resumed",
     },
     SearchPolicy: {
         "searcher": "its forward model simulates the environments as they are; what it noticed is saved",
@@ -76,20 +81,32 @@ NOT_STATE: dict[type, dict[str, str]] = {
         "globals": "variables of SB3's module",
     },
     ProgressBarCallback: {"pbar": "drawn anew"},
+    Logger: {"dir": "where to write is not for a checkpoint to decide; checked when the run was resumed"},
     KVWriter: {"file": _FILE, "writer": _FILE},
 }
 
 
-def not_state_of(component: Any) -> frozenset[str]:
+def not_state_of(component: Any, saved: Iterable[str] = ()) -> frozenset[str]:
     """Return the names of a component's attributes that are neither saved nor restored.
 
     :param component: from :func:`components`.
+    :param saved: names of attributes that it may not have, but a checkpoint does.
     """
     names = {name for cls, reasons in NOT_STATE.items() if isinstance(component, cls) for name in reasons}
     if isinstance(component, ReplayBuffer):
         names |= row_attributes(component)
+    if isinstance(component, BaseCallback | VecEnv):
+        names |= {name for name in {*vars(component), *saved} if _is_place(component, name)}
     own = getattr(type(component), "not_checkpointed", ())
     return frozenset(names | set(own))
+
+
+def _is_place(component: Any, name: str) -> bool:
+    """Whether an attribute says where something is written, which is not for a checkpoint to decide."""
+    value = vars(component).get(name, getattr(type(component), name, None))
+    if isinstance(value, os.PathLike):
+        return True
+    return (value is None or isinstance(value, str)) and _PLACE.search(name) is not None
 
 
 def components(agent: OffPolicyAlgorithm, callback: BaseCallback) -> dict[str, Any]:

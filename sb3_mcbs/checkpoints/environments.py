@@ -68,13 +68,16 @@ def _encode(wrapper: SnapshotEnvWrapper, with_generators: bool) -> tuple[Encoder
     return encoder, Encoded(data, encoder.arrays)
 
 
-def restore_environment(wrapper: SnapshotEnvWrapper, encoded: Encoded, classes: tuple[Any, ...]) -> None:
-    """Put an environment into a state.
+def restore_environment(
+    wrapper: SnapshotEnvWrapper, encoded: Encoded, classes: tuple[Any, ...]
+) -> list[np.ndarray | None]:
+    """Put an environment into a state, all but the files of its Monitors.
 
     :param wrapper: the environment, made the same way.
     :param encoded: from :func:`capture_environment`.
     :param classes: classes and functions that the checkpoint may refer to, besides those that the
         environment uses.
+    :return: what :func:`write_monitor_files` is to write.
     :raises CheckpointError: if the state is of another environment.
     """
     if wrapper.last_observation is None:
@@ -90,14 +93,23 @@ def restore_environment(wrapper: SnapshotEnvWrapper, encoded: Encoded, classes: 
         raise CheckpointError(
             f"The environment is not made as the one of the checkpoint: {error} Pass an env that is."
         ) from error
-    monitors = list(_monitors(wrapper))
-    for monitor, (t_start, written) in zip(monitors, content["monitors"], strict=False):
+    for monitor, (t_start, _) in zip(_monitors(wrapper), content["monitors"], strict=False):
         monitor.t_start = t_start
+    if content["generators"] is not None:
+        set_generators(content["generators"])
+    return [written for _, written in content["monitors"]]
+
+
+def write_monitor_files(wrapper: SnapshotEnvWrapper, contents: list[np.ndarray | None]) -> None:
+    """Make the files of an environment's Monitors hold what they held.
+
+    :param wrapper: the environment.
+    :param contents: from :func:`restore_environment`.
+    """
+    for monitor, written in zip(_monitors(wrapper), contents, strict=False):
         file = results_file(monitor)
         if file is not None and written is not None:
             write_again(file, written)
-    if content["generators"] is not None:
-        set_generators(content["generators"])
 
 
 def _monitors(env: gym.Env) -> Iterator[Monitor]:
@@ -170,6 +182,7 @@ def make_environment(description: dict[str, Any]) -> SnapshotEnvWrapper:
             allow_early_resets=monitor["allow_early_resets"],
             reset_keywords=tuple(monitor["reset_keywords"]),
             info_keywords=tuple(monitor["info_keywords"]),
+            override_existing=False,  # emptied only when the run goes on
         )
     return SnapshotEnvWrapper(env)
 

@@ -1,7 +1,9 @@
 """The files that a run writes line by line: Monitor's, and those of the logger."""
 
+import io
 import os
 import sys
+import tempfile
 from pathlib import Path
 from typing import IO, Any
 
@@ -23,12 +25,27 @@ _FILE_FORMATS: dict[str, Any] = {"log": HumanOutputFormat, "json": JSONOutputFor
 _SUFFIXES = {"log": (".txt", ".log"), "json": (".json", ".jsonl"), "csv": (".csv",)}
 
 
+class Unopened(io.StringIO):
+    """Takes the place of a log file until the run goes on: what is written until then is dropped.
+
+    Opening it would empty it, also for a run that is then refused or never continued.
+
+    :param path: the file.
+    """
+
+    def __init__(self, path: str) -> None:
+        super().__init__()
+        self.name = path
+
+
 def read_written(handle: Any) -> np.ndarray:
     """Return what a file that is open for writing holds so far.
 
     :param handle: the open file.
     :return: its bytes, ``[size]`` uint8.
     """
+    if isinstance(handle, Unopened):
+        return np.empty(0, np.uint8)
     handle.flush()
     return np.fromfile(handle.name, np.uint8)
 
@@ -39,9 +56,10 @@ def write_again(handle: Any, content: np.ndarray) -> None:
     :param handle: the open file.
     :param content: from :func:`read_written`.
     """
+    text = content.tobytes().decode(handle.encoding)
     handle.seek(0)
     handle.truncate()
-    handle.write(content.tobytes().decode(handle.encoding))
+    handle.write(text)
     handle.flush()
 
 
@@ -85,15 +103,29 @@ def file_of(output_format: Any) -> IO[Any] | None:
 def make_logger(
     folder: str | None, formats: list[tuple[str, str | None]], purge_step: int, roots: list[Path]
 ) -> Logger:
-    """Make a logger that goes on where another one was.
+    """Make a logger that goes on where another one was, once :func:`open_log_files` has opened its files.
 
-    :param folder: the logger's folder.
+    :param folder: the logger's folder; another one takes its place if it is in none of the roots.
     :param formats: from :func:`describe_format`.
     :param purge_step: TensorBoard forgets what was logged at this step and later.
     :param roots: folders that files may be in.
     :raises CheckpointError: if a file is in none of them.
     """
+    if folder is not None and not _is_below(folder, roots):
+        folder = tempfile.gettempdir()  # within which SB3 has it by default
     return Logger(folder, [_make_format(kind, path, purge_step, roots) for kind, path in formats])
+
+
+def open_log_files(logger: Logger) -> None:
+    """Open the files of a logger that :func:`make_logger` made. They are empty then.
+
+    :param logger: any logger; what is open stays as it is.
+    """
+    for output_format in logger.output_formats:
+        file = getattr(output_format, "file", None)
+        if isinstance(file, Unopened):
+            Path(file.name).parent.mkdir(parents=True, exist_ok=True)
+            output_format.file = open(file.name, "w+")  # type: ignore[attr-defined]  # noqa: SIM115
 
 
 def _make_format(kind: str, path: str | None, purge_step: int, roots: list[Path]) -> KVWriter:
@@ -102,15 +134,31 @@ def _make_format(kind: str, path: str | None, purge_step: int, roots: list[Path]
     check_below(path, roots)
     if kind == "tensorboard":
         output_format = TensorBoardOutputFormat.__new__(TensorBoardOutputFormat)
-        from torch.utils.tensorboard import SummaryWriter
-
-        output_format.writer = SummaryWriter(log_dir=path, purge_step=purge_step)
+        output_format.writer = _make_writer(path, purge_step)
         output_format._is_closed = False
         return output_format
     if kind not in _FILE_FORMATS or not path.endswith(_SUFFIXES[kind]):
         raise CheckpointError(f"The checkpoint names {path!r} as a log file of kind {kind!r}.")
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    return _FILE_FORMATS[kind](path)
+    output_format = _FILE_FORMATS[kind](os.devnull)
+    output_format.file.close()
+    output_format.file = Unopened(path)
+    return output_format
+
+
+def _make_writer(folder: str, purge_step: int) -> Any:
+    from torch.utils.tensorboard import SummaryWriter
+
+    class LateWriter(SummaryWriter):
+        """Makes its file, which hides what was logged later, with the first value that is logged."""
+
+        is_made = False
+
+        def _get_file_writer(self) -> Any:
+            return super()._get_file_writer() if self.is_made else None
+
+    writer = LateWriter(log_dir=folder, purge_step=purge_step)
+    writer.is_made = True
+    return writer
 
 
 def check_below(path: str, roots: list[Path]) -> None:
@@ -120,9 +168,14 @@ def check_below(path: str, roots: list[Path]) -> None:
     :param roots: folders that it may be in.
     :raises CheckpointError: if it is in none of them.
     """
-    resolved = Path(path).resolve()
-    if not any(resolved.is_relative_to(root.resolve()) for root in roots):
+    if not _is_below(path, roots):
         raise CheckpointError(
-            f"The run logged to {resolved}, which is neither below the present folder nor beside its "
-            "checkpoints. If you want it to go on writing there, pass log_folder= with a folder above it."
+            f"The run logged to {Path(path).resolve()}, which is neither below the present folder nor "
+            "beside its checkpoints. If you want it to go on writing there, pass log_folder= with a folder "
+            "above it."
         )
+
+
+def _is_below(path: str, roots: list[Path]) -> bool:
+    resolved = Path(path).resolve()
+    return any(resolved.is_relative_to(root.resolve()) for root in roots)

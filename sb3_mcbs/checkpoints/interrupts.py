@@ -50,6 +50,7 @@ class Interrupts:
         :param workers: environments in worker processes.
         """
         self.received = None
+        self._give_back()  # not done yet if the last training ended in an error
         if threading.current_thread() is not threading.main_thread():
             return
         for signum in _SIGNALS:

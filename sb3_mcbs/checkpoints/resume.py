@@ -61,6 +61,8 @@ def resume(
             check_below(file, roots)
         env = make_vec_env(manifest["environment"])
     agent = make_agent(resumption.settings, names, env)
+    if agent.tensorboard_log is not None:
+        check_below(agent.tensorboard_log, roots)
     set_networks(agent, resumption.checkpoint.arrays)
     resumption.attach(agent, roots)
     return agent

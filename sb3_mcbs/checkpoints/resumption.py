@@ -32,12 +32,14 @@ class Resumption:
     :param store: the folder of checkpoints.
     :param checkpoint: the one to continue from.
     :param classes: classes and functions that the caller trusts.
+    :ivar is_carried_out: whether the run goes on; until then its files are as they were.
     """
 
     def __init__(self, store: Store, checkpoint: Checkpoint, classes: tuple[Any, ...]) -> None:
         self.store = store
         self.checkpoint = checkpoint
         self.classes = classes
+        self.is_carried_out = False
 
     @property
     def settings(self) -> Encoded:
@@ -60,6 +62,9 @@ class Resumption:
         def checked_setup_learn(*args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
             total, callback = setup_learn(*args, **kwargs)
             self.check_call(agent, callback)
+            if manifest["num_timesteps"] >= total:
+                # Stopped at its end: learn() collects nothing, and all is put back when training ends.
+                agent.num_timesteps = manifest["num_timesteps"]
             return total, callback
 
         # Without the callback nobody would notice that the run starts from the beginning.
@@ -99,7 +104,7 @@ class Resumption:
     def carry_out(self, agent: OffPolicyAlgorithm, run: RunState, settings: Encoded) -> None:
         """Put the run into the saved state.
 
-        :param agent: the agent, about to collect its first rollout.
+        :param agent: the agent, about to collect its first rollout, or at its end if none is left.
         :param run: all of the run.
         :param settings: of the agent.
         """
@@ -108,6 +113,7 @@ class Resumption:
         checkpoint = self.checkpoint
         write_rows(agent.replay_buffer, self.store.read_rows(checkpoint.manifest["rows"]))
         run.restore(Captured(checkpoint.state, checkpoint.arrays), self.classes)
+        self.is_carried_out = True
         for name in _UNTIL_RESUMED:
             del vars(agent)[name]
         self._say(agent)

@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import NStepReplayBuffer
+from stable_baselines3.common.monitor import ResultsWriter
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import (
@@ -143,8 +144,10 @@ def make_vec_env(description: dict[str, Any]) -> VecEnv:
         if name == "VecNormalize":
             vec_env = VecNormalize(vec_env, **arguments)
         else:
-            keywords = tuple(arguments["info_keywords"])
-            vec_env = VecMonitor(vec_env, arguments["filename"], keywords)
+            keywords, filename = tuple(arguments["info_keywords"]), arguments["filename"]
+            vec_env = VecMonitor(vec_env, info_keywords=keywords)
+            if filename is not None:  # emptied only when the run goes on
+                vec_env.results_writer = ResultsWriter(filename, None, keywords, override_existing=False)
     return vec_env
 
 

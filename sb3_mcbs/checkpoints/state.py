@@ -18,9 +18,10 @@ from sb3_mcbs.checkpoints.environments import (
     read_generators,
     restore_environment,
     set_generators,
+    write_monitor_files,
 )
 from sb3_mcbs.checkpoints.errors import CheckpointError
-from sb3_mcbs.checkpoints.files import file_of, read_written, results_file, write_again
+from sb3_mcbs.checkpoints.files import file_of, open_log_files, read_written, results_file, write_again
 from sb3_mcbs.checkpoints.kinds import KINDS, kind_of
 from sb3_mcbs.checkpoints.names import known_names
 from sb3_mcbs.models import Environments, WorkerEnvironments
@@ -107,12 +108,18 @@ class RunState:
             raise CheckpointError(
                 f"The checkpoint holds {sorted(captured.json)}, this run consists of {sorted([RUN, *own])}."
             )
+        monitors = {}
         for name, environments in self._environments.items():
             indices = range(len(environments))
             arguments = [(_section(captured, f"{name}[{index}]"), classes) for index in indices]
-            environments.apply_each(indices, restore_environment, arguments)
+            monitors[name] = environments.apply_each(indices, restore_environment, arguments)
         set_networks(self._agent, captured.arrays)
-        self._decode(_section(captured, RUN), classes)
+        rest = self._decode(_section(captured, RUN), classes)
+        # Files come after all that may be refused: a run that does not go on leaves them as they were.
+        for name, environments in self._environments.items():
+            contents = [(written,) for written in monitors[name]]
+            environments.apply_each(range(len(environments)), write_monitor_files, contents)
+        self._set_rest(rest)
 
     def _encode(self) -> tuple[Encoder, Encoded]:
         parts = self._components
@@ -140,7 +147,7 @@ class RunState:
         }
         return encoder, Encoded(data, encoder.arrays)
 
-    def _decode(self, encoded: Encoded, classes: tuple[Any, ...]) -> None:
+    def _decode(self, encoded: Encoded, classes: tuple[Any, ...]) -> dict[str, Any]:
         parts = self._components
         names = {**known_names(classes), **self._encode()[0].names}
         decoder = Decoder(encoded.arrays, names)
@@ -149,20 +156,24 @@ class RunState:
             raise CheckpointError("The checkpoint's run has other parts than this one.")
         try:
             for name, part in parts.items():
-                attributes = decoder.decode(encoded.json["attributes"][name])
-                thaw_attributes(thawer, part, not_state_of(part), attributes, delete_others=True)
+                saved = decoder.decode(encoded.json["attributes"][name])
+                not_state = not_state_of(part, saved)
+                attributes = {key: value for key, value in saved.items() if key not in not_state}
+                thaw_attributes(thawer, part, not_state, attributes, delete_others=True)
         except SnapshotError as error:
             raise CheckpointError(
                 f"The checkpoint is of a run that was set up differently: {error}"
             ) from error
+        rest = decoder.decode(encoded.json["rest"])
         thawer.commit()
-        self._set_rest(decoder.decode(encoded.json["rest"]))
+        return rest
 
     def _set_rest(self, rest: dict[str, Any]) -> None:
         agent = self._agent
         agent.start_time = time.time_ns() - int(rest["seconds"] * 1e9)
         for name, searcher in self._searchers().items():
             searcher.memory = rest["searchers"][name]
+        open_log_files(agent.logger)
         for name, written in rest["files"].items():
             if written is not None:
                 write_again(self._file(self._components[name]), written)

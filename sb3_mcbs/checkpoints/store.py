@@ -195,12 +195,14 @@ class Store:
         os.rename(unfinished, final)
         sync_folder(self.folder)
 
-    def clean(self, keep_last: int) -> None:
+    def clean(self, keep_last: int, newest: int) -> None:
         """Remove what no kept checkpoint needs.
 
         :param keep_last: how many checkpoints to keep.
+        :param newest: environment steps of the one that was just written. There are later ones if the run was
+            resumed from an older one, as it is if those are damaged: they do not count.
         """
-        for step in self.steps()[keep_last:]:
+        for step in [step for step in self.steps() if step <= newest][keep_last:]:
             _remove(self.path_of(step))
         for unfinished in (*self.folder.glob(_UNFINISHED + "*"), *self.rows_folder.glob(_UNFINISHED + "*")):
             _remove(unfinished)
@@ -221,6 +223,13 @@ class Store:
         :raises CheckpointError: if a file is not what the manifest says.
         """
         return [read_arrays(self._rows_file(part)) for part in parts]
+
+    def has_rows(self, part: dict[str, Any]) -> bool:
+        """Whether a file with rows is still there.
+
+        :param part: how a manifest refers to it.
+        """
+        return self._rows_file(part).is_file()
 
     def _rows_file(self, part: dict[str, Any]) -> Path:
         name = str(part["name"])

@@ -19,10 +19,14 @@ def resume(run_folder: str | Path) -> None:
     _, args = load_run(folder)
     resumption = read_resumption(folder / CHECKPOINTS)
     MCBSExperimentManager.resumed_run = ResumedRun(folder, resumption, args.get("tensorboard_log") or None)
+    monitor_files = {path: path.read_bytes() for path in folder.glob("*.monitor.csv")}
     try:
         repeat(folder)
     finally:
         MCBSExperimentManager.resumed_run = None
+        if not resumption.is_carried_out:  # RL Zoo empties them before anything is checked
+            for path, content in monitor_files.items():
+                path.write_bytes(content)
 
 
 def main() -> None:
