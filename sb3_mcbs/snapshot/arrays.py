@@ -1,6 +1,6 @@
 """NumPy arrays: owned, views of each other, and views into a simulator's memory."""
 
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -9,21 +9,21 @@ from sb3_mcbs.snapshot.graph import Copier, Freezer, Thawer
 
 
 class ArrayKind:
-    """NumPy arrays. A view stays a view of the same array."""
+    """NumPy arrays. A view stays a view of the same array, or of the same ``bytearray``."""
 
     name = "array"
 
     def freeze(self, freezer: Freezer, obj: np.ndarray) -> Any:
+        base, layout = (None, None) if obj.base is None else _base_and_layout(obj)
+        if layout is not None:
+            return "view", freezer.freeze(base), layout
         if obj.dtype.hasobject:
-            return "objects", obj.shape, obj.dtype, [freezer.freeze(item) for item in obj.ravel().tolist()]
-        base = obj.base
-        if isinstance(base, np.ndarray) and type(base) is np.ndarray and not _is_borrowed(base):
-            layout = _layout_in(obj, base)
-            if layout is not None:
-                return "view", freezer.freeze(base), layout
+            items = [freezer.freeze(item) for item in obj.ravel().tolist()]
+            return "objects", obj.shape, obj.dtype, _order(obj), items
         content = obj.copy(order="K")
         content.setflags(write=False)
-        return "borrowed" if _is_borrowed(obj) else "own", content, obj.flags.writeable
+        borrowed = obj.base is not None and _is_borrowed(obj)
+        return "borrowed" if borrowed else "own", content, obj.flags.writeable
 
     def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
         form = payload[0]
@@ -32,9 +32,10 @@ class ArrayKind:
         if form == "view":
             return _view_of(thawer.thaw(payload[1]), payload[2])
         if form == "objects":
-            _, shape, dtype, items = payload
-            array = thawer.memo[index] = np.empty(shape, dtype)
-            array.ravel()[:] = [thawer.thaw(item) for item in items]
+            _, shape, dtype, order, items = payload
+            array = thawer.memo[index] = np.empty(shape, dtype, order)
+            for place, item in zip(np.ndindex(shape), items, strict=True):
+                array[place] = thawer.thaw(item)
             return array
         content = payload[1]
         if not isinstance(current, np.ndarray) or current.shape != content.shape or not _is_borrowed(current):
@@ -47,10 +48,13 @@ class ArrayKind:
         return current
 
     def copy(self, copier: Copier, obj: np.ndarray) -> Any:
+        base, layout = (None, None) if obj.base is None else _base_and_layout(obj)
+        if layout is not None:
+            return _view_of(copier.copy(base), layout)
         if obj.dtype.hasobject:
-            array = copier.enter(obj, np.empty(obj.shape, obj.dtype))
-            for place, item in enumerate(obj.ravel().tolist()):
-                array.reshape(-1)[place] = copier.copy(item)
+            array = copier.enter(obj, np.empty(obj.shape, obj.dtype, _order(obj)))
+            for place, item in zip(np.ndindex(obj.shape), obj.ravel().tolist(), strict=True):
+                array[place] = copier.copy(item)
             return array
         if _is_borrowed(obj):
             for adapter, old, new in copier.adapted:
@@ -58,33 +62,70 @@ class ArrayKind:
                 if view is not None:
                     return view
             raise SnapshotUnsupportedError("it is a view into memory that belongs to nothing that is copied")
-        base = obj.base
-        if type(base) is np.ndarray:
-            layout = _layout_in(obj, base)
-            if layout is not None:
-                return _view_of(copier.copy(base), layout)
         return _with_flag(obj.copy(order="K"), obj.flags.writeable)
+
+
+class BytearrayKind:
+    """Bytes that can be changed."""
+
+    name = "bytearray"
+
+    def freeze(self, freezer: Freezer, obj: bytearray) -> Any:
+        return bytes(obj)
+
+    def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
+        return bytearray(payload)
+
+    def copy(self, copier: Copier, obj: bytearray) -> Any:
+        return bytearray(obj)
+
+
+def _owner(array: np.ndarray) -> Any:
+    """Return what an array's memory belongs to, if that is not an array."""
+    base: Any = array.base
+    while isinstance(base, np.ndarray):
+        base = base.base
+    return base.obj if isinstance(base, memoryview) else base
 
 
 def _is_borrowed(array: np.ndarray) -> bool:
     """Return whether the memory belongs to a simulator, a file or another process."""
-    root: Any = array
-    while isinstance(root.base, np.ndarray):
-        root = root.base
-    return root.base is not None and not isinstance(root.base, bytes | bytearray)
+    owner = _owner(array)
+    return owner is not None and not isinstance(owner, bytes | bytearray)
+
+
+def _order(array: np.ndarray) -> Literal["C", "F"]:
+    return "F" if array.flags.f_contiguous and not array.flags.c_contiguous else "C"
+
+
+def _base_and_layout(array: np.ndarray) -> tuple[Any, tuple[Any, ...] | None]:
+    """Return what an array is a view of and where; no layout if it is captured by itself."""
+    base = array.base
+    if type(base) is np.ndarray:
+        return base, None if _is_borrowed(base) else _layout_in(array, base)
+    owner = _owner(array)
+    if type(owner) is not bytearray or not owner or isinstance(base, np.ndarray):
+        return None, None
+    return owner, _layout_in(array, np.frombuffer(owner, np.uint8))
 
 
 def _layout_in(view: np.ndarray, base: np.ndarray) -> tuple[Any, ...] | None:
     """Describe where a view lies in its base, or return None if it must be captured by itself."""
-    if not (base.flags.c_contiguous or base.flags.f_contiguous) or base.dtype.hasobject:
+    if not (base.flags.c_contiguous or base.flags.f_contiguous):
+        return None
+    if base.dtype.hasobject and base.dtype != view.dtype:
         return None
     offset = view.__array_interface__["data"][0] - base.__array_interface__["data"][0]
     return offset, view.shape, view.dtype, view.strides, view.flags.writeable
 
 
-def _view_of(base: np.ndarray, layout: tuple[Any, ...]) -> np.ndarray:
+def _view_of(base: Any, layout: tuple[Any, ...]) -> np.ndarray:
     offset, shape, dtype, strides, writeable = layout
-    memory = base.ravel(order="K").view(np.uint8)
+    memory = base
+    if isinstance(base, np.ndarray):
+        memory = base.ravel(order="K")
+        # Objects cannot be looked at as bytes.
+        memory = memory if base.dtype.hasobject else memory.view(np.uint8)
     return _with_flag(np.ndarray(shape, dtype, memory, offset, strides), writeable)
 
 

@@ -7,7 +7,7 @@ import gymnasium as gym
 from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
 from sb3_mcbs.snapshot.graph import ATOMIC_CLASSES, MISSING, Freezer, Ref, Thawer
 from sb3_mcbs.snapshot.kinds import kind_of
-from sb3_mcbs.snapshot.objects import set_attributes
+from sb3_mcbs.snapshot.objects import attributes_of, set_attributes
 from sb3_mcbs.snapshot.randomness import thaw_np_random
 
 
@@ -24,7 +24,7 @@ def freeze_attributes(
     :raises SnapshotUnsupportedError: names the attribute.
     """
     attributes = {}
-    for name, value in vars(env).items():
+    for name, value in attributes_of(env).items():
         if name in not_state:
             continue
         if type(value) in ATOMIC_CLASSES:
@@ -53,7 +53,7 @@ def thaw_attributes(
     :param attributes: captured attributes.
     :param delete_others: whether attributes that were not there are deleted.
     """
-    have = vars(env)
+    have = attributes_of(env)
     values = dict(attributes)
     for name, value in attributes.items():
         if type(value) is Ref and name != "_np_random":
@@ -63,11 +63,11 @@ def thaw_attributes(
     # Gymnasium keeps it on the class until it is first needed.
     values.pop("_np_random", None)
     if not isinstance(env, gym.Wrapper):
-        thaw_np_random(thawer, attributes.get("_np_random"), have)
+        thaw_np_random(thawer, attributes.get("_np_random"), vars(env))
     gone = set()
     if delete_others:
-        for name in have:
-            if name not in attributes and name not in not_state and not _stays(name, have[name]):
+        for name in have.keys() - attributes.keys():
+            if name not in not_state and not _stays(name, have[name]):
                 gone.add(name)
     thawer.do_then(set_attributes, env, values, gone)
 

@@ -1,5 +1,6 @@
 """Lists, tuples, sets, deques and dictionaries."""
 
+import operator
 from collections import deque
 from typing import Any
 
@@ -27,7 +28,9 @@ class SequenceKind:
             return cls(thawed)
         made: Any = deque(maxlen=maxlen) if cls is deque else cls()
         thawer.memo[index] = made
-        (made.update if cls is set else made.extend)(thawed)
+        if cls is set:
+            return _kept_or_filled(thawer, index, made, list(thawed), current)
+        made.extend(thawed)
         return made
 
     def copy(self, copier: Copier, obj: Any) -> Any:
@@ -37,6 +40,31 @@ class SequenceKind:
         made: Any = copier.enter(obj, deque(maxlen=obj.maxlen) if cls is deque else cls())
         (made.update if cls is set else made.extend)([copier.copy(item) for item in obj])
         return made
+
+
+# Equal objects of these are the same, bit for bit.
+_EQUAL_IS_SAME = frozenset({type(None), bool, int, str, bytes})
+
+
+def _kept_or_filled(thawer: Thawer, index: int, made: set[Any], items: list[Any], current: Any) -> set[Any]:
+    """Fill a set, or keep the one that is there if only that lists the items in the captured order.
+
+    The order depends on what a set held before, which nobody can read.
+    """
+    made.update(items)
+    if type(current) is not set or len(current) != len(made) or all(map(operator.is_, made, items)):
+        return made
+    if all(map(_is_same, current, items)) and thawer.claim(current):
+        made = thawer.memo[index] = current
+    return made
+
+
+def _is_same(one: Any, other: Any) -> bool:
+    if type(one) is not type(other):
+        return False
+    if type(one) is tuple:
+        return len(one) == len(other) and all(map(_is_same, one, other))
+    return type(one) in _EQUAL_IS_SAME and bool(one == other)
 
 
 def freeze_items(freezer: Freezer, items: Any) -> tuple[Any, ...]:

@@ -1,14 +1,17 @@
-"""Functions and methods that environments hold: what they close over is state."""
+"""Functions and methods that environments hold: what they close over, defaults and attributes are state."""
 
 import functools
 import importlib
+import sys
 import types
 from typing import Any
 
 from sb3_mcbs.snapshot.errors import SnapshotMismatchError, SnapshotUnsupportedError
-from sb3_mcbs.snapshot.graph import MISSING, Copier, Freezer, Thawer
+from sb3_mcbs.snapshot.graph import ATOMIC_CLASSES, MISSING, Copier, Freezer, Thawer
 
 _EMPTY = ("empty",)
+# Names what a function was made from, which is not state.
+_WRAPPED = "__wrapped__"
 
 
 @functools.lru_cache(maxsize=1024)
@@ -68,11 +71,17 @@ class FunctionName:
 
 
 class FunctionKind:
-    """Python functions: their code is fixed, what they close over is state."""
+    """Python functions: their code is fixed; what they close over, their defaults and attributes are state.
+
+    Of a function that its module names, defaults and attributes are global, and so is what it closes over if
+    that cannot be captured.
+    """
 
     name = "function"
 
     def freeze(self, freezer: Freezer, obj: types.FunctionType) -> Any:
+        if not _is_own(obj):
+            return FunctionName(obj), freezer.freeze_or_none(*(obj.__closure__ or ())) or (), None
         cells = []
         for name, cell in zip(obj.__code__.co_freevars, obj.__closure__ or (), strict=True):
             try:
@@ -80,27 +89,113 @@ class FunctionKind:
             except SnapshotUnsupportedError as error:
                 error.path.insert(0, f" (variable {name} of {obj.__qualname__})")
                 raise
-        return FunctionName(obj), tuple(cells)
+        return FunctionName(obj), tuple(cells), _freeze_extras(freezer, obj)
 
     def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
-        name, cells = payload
+        name, cells, extras = payload
         if name.is_name_of(current):
             thawer.memo[index] = current
-            for value, cell in zip(cells, current.__closure__ or (), strict=True):
-                thawer.thaw(value, cell)
+            if cells:
+                for value, cell in zip(cells, current.__closure__ or (), strict=True):
+                    thawer.thaw(value, cell)
+            _thaw_extras(thawer, extras, current, live=True)
             return current
         function = name.find()
-        if not cells:
+        if not cells and extras in (None, _NO_EXTRAS):
             return function
         # The function that was found closes over another instance's variables, which are not to be touched.
-        return _with_cells(function, tuple(thawer.thaw(value) for value in cells))
+        missing = [ref for ref in cells if ref.index not in thawer.memo]
+        thawer.memo.update((ref.index, types.CellType()) for ref in missing)
+        made = thawer.memo[index] = _with_cells(function, tuple(thawer.memo[ref.index] for ref in cells))
+        for ref in missing:
+            _thaw_content(thawer, thawer.memo[ref.index], thawer.nodes[ref.index][1])
+        _thaw_extras(thawer, extras, made, live=False)
+        return made
 
     def copy(self, copier: Copier, obj: types.FunctionType) -> Any:
-        cells = obj.__closure__ or ()
-        copies = tuple(copier.copy(cell) for cell in cells)
-        if all(new is old for new, old in zip(copies, cells, strict=True)):
+        if _is_own(obj):
+            return _copy(copier, obj, _extras(obj))
+        try:
+            return _copy(copier, obj, _NO_EXTRAS)
+        except SnapshotUnsupportedError:
             return obj
-        return _with_cells(obj, copies)
+
+
+Extras = tuple[Any, Any, Any]
+
+_NO_EXTRAS: Extras = (None, None, ())
+
+
+def _is_own(function: types.FunctionType) -> bool:
+    """Return whether a function belongs to one environment: no module names it."""
+    if "<" in function.__qualname__:
+        return True
+    found: Any = sys.modules.get(function.__module__)
+    for part in function.__qualname__.split("."):
+        found = getattr(found, part, None)
+    return found is not function
+
+
+def _extras(function: types.FunctionType) -> Extras:
+    """Return the defaults and keyword defaults of a function, if they can change, and its attributes."""
+    defaults, keywords = function.__defaults__, function.__kwdefaults__
+    return (
+        None if defaults is None or ATOMIC_CLASSES.issuperset(map(type, defaults)) else defaults,
+        None if keywords is None or ATOMIC_CLASSES.issuperset(map(type, keywords.values())) else keywords,
+        tuple((name, value) for name, value in vars(function).items() if name != _WRAPPED),
+    )
+
+
+def _freeze_extras(freezer: Freezer, function: types.FunctionType) -> Extras:
+    defaults, keywords, attributes = _extras(function)
+    try:
+        return (
+            freezer.freeze(defaults),
+            freezer.freeze(keywords),
+            tuple((name, freezer.freeze(value)) for name, value in attributes),
+        )
+    except SnapshotUnsupportedError as error:
+        error.path.insert(0, f" (default or attribute of {function.__qualname__})")
+        raise
+
+
+def _thaw_extras(thawer: Thawer, extras: Extras | None, function: types.FunctionType, live: bool) -> None:
+    """Plan to give a function its defaults and attributes; only a live one's own may be used again."""
+    if extras is None:
+        return
+    for name, value in zip(("__defaults__", "__kwdefaults__"), extras, strict=False):
+        if value is not None:
+            there = getattr(function, name) if live else None
+            thawer.do_then(setattr, function, name, thawer.thaw(value, MISSING if there is None else there))
+    have = vars(function) if live else {}
+    for name, value in extras[2]:
+        thawed = thawer.thaw(value, have.get(name, MISSING))
+        if thawed is not MISSING:
+            thawer.do_then(setattr, function, name, thawed)
+    kept = {_WRAPPED, *(name for name, _ in extras[2])}
+    for name in vars(function).keys() - kept:
+        thawer.do_then(delattr, function, name)
+
+
+def _copy(copier: Copier, function: types.FunctionType, extras: Extras) -> types.FunctionType:
+    """Copy a function with what it closes over, before which it is known itself: it may call itself."""
+    cells = function.__closure__ or ()
+    if not cells and extras == _NO_EXTRAS:
+        return function
+    missing = [cell for cell in cells if id(cell) not in copier.memo]
+    for cell in missing:
+        copier.enter(cell, types.CellType())
+    made = copier.enter(function, _with_cells(function, tuple(copier.memo[id(cell)] for cell in cells)))
+    for cell in missing:
+        _copy_content(copier, cell, copier.memo[id(cell)])
+    defaults, keywords, attributes = extras
+    if defaults is not None:
+        made.__defaults__ = copier.copy(defaults)
+    if keywords is not None:
+        made.__kwdefaults__ = copier.copy(keywords)
+    for name, value in attributes:
+        setattr(made, name, copier.copy(value))
+    return made
 
 
 def _with_cells(function: types.FunctionType, cells: tuple[types.CellType, ...]) -> types.FunctionType:
@@ -131,21 +226,28 @@ class CellKind:
 
     def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
         cell = thawer.memo[index] = types.CellType() if current is MISSING else current
-        if payload == _EMPTY:
-            return cell
-        have = _content(cell)
-        value = thawer.thaw(payload[1], have)
-        if value is not have and value is not MISSING:
-            thawer.do_then(setattr, cell, "cell_contents", value)
+        _thaw_content(thawer, cell, payload)
         return cell
 
     def copy(self, copier: Copier, obj: types.CellType) -> Any:
-        content = _content(obj)
-        if content is MISSING:
-            return obj
         made = copier.enter(obj, types.CellType())
-        made.cell_contents = copier.copy(content)
+        _copy_content(copier, obj, made)
         return made
+
+
+def _thaw_content(thawer: Thawer, cell: types.CellType, payload: Any) -> None:
+    if payload == _EMPTY:
+        return
+    have = _content(cell)
+    value = thawer.thaw(payload[1], have)
+    if value is not have and value is not MISSING:
+        thawer.do_then(setattr, cell, "cell_contents", value)
+
+
+def _copy_content(copier: Copier, cell: types.CellType, made: types.CellType) -> None:
+    content = _content(cell)
+    if content is not MISSING:
+        made.cell_contents = copier.copy(content)
 
 
 def _content(cell: Any) -> Any:

@@ -82,6 +82,7 @@ class Freezer:
         self.adapted: list[Any] = []
         self._kind_of = kind_of
         self._memo = dict(known)
+        self._owners: dict[int, Ref] = {}
         # An id is only unique among objects that live, and some objects on the way are temporary.
         self._alive: list[Any] = []
 
@@ -102,19 +103,32 @@ class Freezer:
         self.nodes[ref.index] = (kind.name, kind.freeze(self, value))
         return ref
 
-    def freeze_or_none(self, value: Any) -> tuple[Any] | None:
-        """Return a frozen value in a tuple, or None where :meth:`freeze` would raise.
+    def owner_of(self, part: Any, obj: Any) -> Ref | None:
+        """Return the node that a part was captured with; None if an object is the first to have it.
 
-        :param value: any value that an environment holds.
+        :param part: what several objects may consist of, such as the bit generator of a generator.
+        :param obj: the object that is being frozen; from now on, the part's owner if it has none.
         """
-        n_nodes, n_alive = len(self.nodes), len(self._alive)
+        owner = self._owners.get(id(part))
+        if owner is None:
+            self._owners[id(part)] = self._memo[id(obj)]
+        return owner
+
+    def freeze_or_none(self, *values: Any) -> tuple[Any, ...] | None:
+        """Return frozen values, or None where :meth:`freeze` would raise for one of them.
+
+        :param values: any values that an environment holds.
+        """
+        n_nodes, n_alive, n_adapted = len(self.nodes), len(self._alive), len(self.adapted)
         try:
-            return (self.freeze(value),)
+            return tuple([self.freeze(value) for value in values])
         except SnapshotUnsupportedError:
             for obj in self._alive[n_alive:]:
                 self._memo.pop(id(obj), None)
+            self._owners = {part: ref for part, ref in self._owners.items() if ref.index < n_nodes}
             del self.nodes[n_nodes:]
             del self._alive[n_alive:]
+            del self.adapted[n_adapted:]
             return None
 
 
@@ -132,7 +146,7 @@ class Thawer:
     ) -> None:
         self.rng = rng
         self.memo: dict[int, Any] = dict(enumerate(known))
-        self._nodes = nodes
+        self.nodes = nodes
         self._kinds = kinds
         self._claimed: set[int] = {id(obj) for obj in known}
         self._first: list[tuple[Any, ...]] = []
@@ -150,7 +164,7 @@ class Thawer:
         index = value.index
         if index in self.memo:
             return self.memo[index]
-        name, payload = self._nodes[index]
+        name, payload = self.nodes[index]
         thawed = self.memo[index] = self._kinds[name].thaw(self, index, payload, current)
         return thawed
 
@@ -196,7 +210,7 @@ class Copier:
     def __init__(self, kind_of: Callable[[Any], Kind | None], known: dict[int, Any]) -> None:
         self.memo = known
         self.adapted: list[tuple[Any, Any, Any]] = []
-        self._kind_of = kind_of
+        self.kind_of = kind_of
         self._alive: list[Any] = []
 
     def copy(self, value: Any) -> Any:
@@ -205,7 +219,7 @@ class Copier:
         :param value: any value that an environment holds.
         :raises SnapshotUnsupportedError: if part of it cannot be copied.
         """
-        if type(value) in ATOMIC_CLASSES or (kind := self._kind_of(value)) is None:
+        if type(value) in ATOMIC_CLASSES or (kind := self.kind_of(value)) is None:
             return value
         key = id(value)
         if key not in self.memo:

@@ -13,13 +13,13 @@ from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec, WrapperSpec
 
 from sb3_mcbs.snapshot import generators
-from sb3_mcbs.snapshot.arrays import ArrayKind
+from sb3_mcbs.snapshot.arrays import ArrayKind, BytearrayKind
 from sb3_mcbs.snapshot.containers import DictKind, SequenceKind
 from sb3_mcbs.snapshot.errors import SnapshotMismatchError
 from sb3_mcbs.snapshot.functions import BuiltinMethodKind, CellKind, FunctionKind, MethodKind
 from sb3_mcbs.snapshot.graph import ATOMIC_CLASSES, MISSING, Copier, Freezer, Kind, Thawer, class_name
 from sb3_mcbs.snapshot.objects import ObjectKind, ReducedKind, is_global, is_ordinary
-from sb3_mcbs.snapshot.randomness import GeneratorKind, SpaceKind
+from sb3_mcbs.snapshot.randomness import GeneratorKind, SeedsKind, SpaceKind
 from sb3_mcbs.snapshot.registry import SnapshotAdapter, call_on_change, find_adapter
 
 #: Parts of packages that draw: what they hold is not state of the environment.
@@ -47,6 +47,8 @@ _EXACT: dict[type, str] = {
     types.CellType: "cell",
     types.MethodType: "method",
     types.BuiltinMethodType: "builtin",
+    np.random.SeedSequence: "seeds",
+    bytearray: "bytearray",
 }
 _CONSTANT_BASES = (types.ModuleType, EnvSpec, WrapperSpec, logging.Logger, logging.LoggerAdapter)
 
@@ -127,8 +129,8 @@ def plan_adapter(thawer: Thawer, adapter: SnapshotAdapter | None, obj: Any, stat
 #: Kinds by name, as nodes name them.
 KINDS: dict[str, Kind] = {}
 for _kind_class in (
-    ConstantKind, WindowKind, ArrayKind, SequenceKind, DictKind, GeneratorKind, SpaceKind, ObjectKind,
-    ReducedKind, AdapterKind, FunctionKind, CellKind, MethodKind, BuiltinMethodKind,
+    ConstantKind, WindowKind, ArrayKind, BytearrayKind, SequenceKind, DictKind, GeneratorKind, SeedsKind,
+    SpaceKind, ObjectKind, ReducedKind, AdapterKind, FunctionKind, CellKind, MethodKind, BuiltinMethodKind,
 ):  # fmt: skip
     KINDS[_kind_class.name] = _kind_class()
 

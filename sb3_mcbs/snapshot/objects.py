@@ -2,11 +2,12 @@
 
 import copyreg
 import ctypes
-from typing import Any
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
 
 from sb3_mcbs.snapshot.containers import freeze_items
 from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
-from sb3_mcbs.snapshot.graph import MISSING, Copier, Freezer, Thawer, class_name
+from sb3_mcbs.snapshot.graph import MISSING, Copier, Freezer, Ref, Thawer, class_name
 
 
 class ObjectKind:
@@ -26,37 +27,102 @@ class ObjectKind:
 
     def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
         cls, attributes = payload
-        reused = type(current) is cls and thawer.claim(current)
-        made = thawer.memo[index] = current if reused else object.__new__(cls)
-        have = attributes_of(made)
+        have = attributes_of(current) if type(current) is cls else {}
+        if _is_value(cls) or type(current) is not cls or not thawer.claim(current):
+            return _made_anew(thawer, index, cls, attributes, have)
+        thawer.memo[index] = current
         values = {}
         for name, value in attributes:
             thawed = thawer.thaw(value, have.get(name, MISSING))
             if thawed is not MISSING:
                 values[name] = thawed
-        thawer.do_then(set_attributes, made, values, set(have).difference(name for name, _ in attributes))
-        return made
+        thawer.do_then(set_attributes, current, values, set(have).difference(name for name, _ in attributes))
+        return current
 
     def copy(self, copier: Copier, obj: Any) -> Any:
         made = copier.enter(obj, object.__new__(type(obj)))
-        set_attributes(made, {name: copier.copy(value) for name, value in attributes_of(obj).items()}, set())
+        attributes, put = attributes_of(obj), _setter(made)
+        copies = {}
+        for name in sorted(attributes, key=lambda name: not _is_hashed(copier, attributes[name])):
+            copies[name] = copier.copy(attributes[name])
+            put(name, copies[name])
+        _set_in_order(made, {name: copies[name] for name in attributes})
         return made
 
 
-def attributes_of(obj: Any) -> dict[str, Any]:
-    """Return the attributes of an object, those in slots included.
+def _is_value(cls: type) -> bool:
+    """Return whether objects of a class are hashed by what they hold.
 
-    :param obj: an object of an ordinary Python class.
+    Sets and dictionaries look them up by that, so that they must be complete from the start, and none that is
+    there may be changed.
     """
+    return cls.__hash__ is not None and cls.__hash__ is not object.__hash__
+
+
+def _made_anew(thawer: Thawer, index: int, cls: type, attributes: Any, have: dict[str, Any]) -> Any:
+    """Make an object and set its attributes at once.
+
+    Those that a hash is computed from come first: on the way to the others may be a set that it is in.
+    """
+    made: Any = object.__new__(cls)
+    thawer.memo[index] = made
+    put = _setter(made)
+    values = {}
+    for name, value in sorted(attributes, key=lambda item: not _is_hashed(thawer, item[1])):
+        thawed = thawer.thaw(value, have.get(name, MISSING))
+        if thawed is not MISSING:
+            values[name] = thawed
+            put(name, thawed)
+    _set_in_order(made, {name: values[name] for name, _ in attributes if name in values})
+    return made
+
+
+def _is_hashed(walker: Thawer | Copier, value: Any) -> bool:
+    """Return whether an attribute holds what hashes are computed from: a constant, or a tuple of some."""
+    if isinstance(walker, Copier):
+        return type(value) in (tuple, frozenset) or walker.kind_of(value) is None
+    if type(value) is not Ref:
+        return True
+    kind, payload = walker.nodes[value.index]
+    return kind == "sequence" and payload[0] in (tuple, frozenset)
+
+
+def _setter(obj: Any) -> Callable[[str, Any], None]:
+    """Return what sets one attribute of an object that is being made."""
+    if _slots_of(type(obj)):
+        return lambda name, value: set_attributes(obj, {name: value})
+    return attributes_of(obj).__setitem__
+
+
+def _set_in_order(obj: Any, values: dict[str, Any]) -> None:
+    """Set attributes that have been set already, in the order that they shall be listed in."""
+    getattr(obj, "__dict__", {}).clear()
+    set_attributes(obj, values)
+
+
+def attributes_of(obj: Any) -> dict[str, Any]:
+    """Return the attributes of an object, those in slots included. Not to be altered.
+
+    :param obj: an object of an ordinary Python class, a layer included.
+    """
+    slots = _slots_of(type(obj))
+    if not slots and type(obj).__dictoffset__:
+        return obj.__dict__
     attributes = dict(getattr(obj, "__dict__", ()))
-    for name in copyreg._slotnames(type(obj)):  # type: ignore[attr-defined]
+    for name in slots:
         value = getattr(obj, name, MISSING)
         if value is not MISSING:
             attributes[name] = value
     return attributes
 
 
-def set_attributes(obj: Any, values: dict[str, Any], gone: set[str]) -> None:
+def _slots_of(cls: type) -> list[str]:
+    # This is where Python keeps them once it has found them.
+    slots = cls.__dict__.get("__slotnames__")
+    return copyreg._slotnames(cls) if slots is None else slots  # type: ignore[attr-defined]
+
+
+def set_attributes(obj: Any, values: dict[str, Any], gone: Iterable[str] = ()) -> None:
     """Set attributes directly, past any ``__setattr__``.
 
     :param obj: the object.
@@ -66,7 +132,7 @@ def set_attributes(obj: Any, values: dict[str, Any], gone: set[str]) -> None:
     for name in gone:
         object.__delattr__(obj, name)
     own = getattr(obj, "__dict__", None)
-    slots = copyreg._slotnames(type(obj))  # type: ignore[attr-defined]
+    slots = _slots_of(type(obj))
     if own is not None and not slots:
         own.update(values)
         return
@@ -90,13 +156,25 @@ class ReducedKind:
             freezer.freeze(state),
             freeze_items(freezer, items),
             tuple((freezer.freeze(key), freezer.freeze(value)) for key, value in pairs),
+            class_name(type(obj)),
         )
 
     def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
-        function, arguments, state, items, pairs = payload
-        made = thawer.memo[index] = thawer.thaw(function)(*thawer.thaw(arguments))
-        content = [thawer.thaw(item) for item in items]
-        return _fill(made, thawer.thaw(state), content, [(thawer.thaw(k), thawer.thaw(v)) for k, v in pairs])
+        function, arguments, state, items, pairs, cls = payload
+        # What is at its place says what is at the places inside.
+        have = _reduced_or_nothing(current) if class_name(type(current)) == cls else _NOTHING_THERE
+        make = thawer.thaw(function, have.function)
+        made = thawer.memo[index] = make(*thawer.thaw(arguments, have.arguments))
+        content = [
+            thawer.thaw(item, have.items[place] if place < len(have.items) else MISSING)
+            for place, item in enumerate(items)
+        ]
+        pairs_there = dict(have.pairs)
+        filled = []
+        for key, value in pairs:
+            thawed_key = thawer.thaw(key)
+            filled.append((thawed_key, thawer.thaw(value, pairs_there.get(thawed_key, MISSING))))
+        return _fill(made, thawer.thaw(state, have.state), content, filled)
 
     def copy(self, copier: Copier, obj: Any) -> Any:
         function, arguments, state, items, pairs = _reduce(obj)
@@ -105,7 +183,27 @@ class ReducedKind:
         return _fill(made, copier.copy(state), content, [(copier.copy(k), copier.copy(v)) for k, v in pairs])
 
 
-def _reduce(obj: Any) -> tuple[Any, tuple[Any, ...], Any, list[Any], list[Any]]:
+class Reduced(NamedTuple):
+    """An object taken apart: what makes it, and what it is given then."""
+
+    function: Any
+    arguments: Any
+    state: Any
+    items: list[Any]
+    pairs: list[Any]
+
+
+_NOTHING_THERE = Reduced(MISSING, MISSING, MISSING, [], [])
+
+
+def _reduced_or_nothing(obj: Any) -> Reduced:
+    try:
+        return _reduce(obj)
+    except SnapshotUnsupportedError:
+        return _NOTHING_THERE
+
+
+def _reduce(obj: Any) -> Reduced:
     """Take an object apart as pickle would."""
     if isinstance(obj, ctypes._SimpleCData | ctypes._Pointer | ctypes._CFuncPtr | ctypes.CDLL):  # type: ignore[attr-defined]
         raise SnapshotUnsupportedError(f"a {class_name(type(obj))} is a handle into compiled code")
@@ -119,24 +217,27 @@ def _reduce(obj: Any) -> tuple[Any, tuple[Any, ...], Any, list[Any], list[Any]]:
     if isinstance(reduced, str):
         raise SnapshotUnsupportedError(f"its class is {class_name(type(obj))} and it is a global, {reduced}")
     function, arguments, state, items, pairs = (*reduced, None, None, None)[:5]
-    return function, arguments, state, list(items or ()), list(pairs or ())
+    return Reduced(function, arguments, state, list(items or ()), list(pairs or ()))
 
 
 def _fill(made: Any, state: Any, items: list[Any], pairs: list[Any]) -> Any:
-    """Give an object that was made from its reduced form its content, as pickle would."""
-    if state is not None and hasattr(made, "__setstate__"):
-        made.__setstate__(state)
-    elif state is not None:
-        in_dict, in_slots = state if isinstance(state, tuple) and len(state) == 2 else (state, None)
-        vars(made).update(in_dict or {})
-        for name, value in (in_slots or {}).items():
-            setattr(made, name, value)
+    """Give an object that was made from its reduced form its content, in the order in which pickle does."""
     if items:
         (made.extend if hasattr(made, "extend") else lambda given: [made.append(item) for item in given])(
             items
         )
     for key, value in pairs:
         made[key] = value
+    if state is made:
+        # A dictionary whose items are its attributes.
+        made.__dict__ = made
+    elif state is not None and hasattr(made, "__setstate__"):
+        made.__setstate__(state)
+    elif state is not None:
+        in_dict, in_slots = state if isinstance(state, tuple) and len(state) == 2 else (state, None)
+        vars(made).update(in_dict or {})
+        for name, value in (in_slots or {}).items():
+            setattr(made, name, value)
     return made
 
 
@@ -157,6 +258,6 @@ def is_ordinary(cls: type) -> bool:
         return False
     # An object of a compiled class, or of a class derived from one, is larger than its attributes need.
     pointer = ctypes.sizeof(ctypes.c_void_p)
-    places = len(copyreg._slotnames(cls))  # type: ignore[attr-defined]
+    places = len(_slots_of(cls))
     places += (cls.__dictoffset__ > 0) + (cls.__weakrefoffset__ > 0)
     return cls.__itemsize__ == 0 and cls.__basicsize__ <= object.__basicsize__ + places * pointer

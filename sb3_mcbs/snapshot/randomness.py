@@ -7,35 +7,120 @@ from gymnasium import spaces
 
 from sb3_mcbs.snapshot import generators
 from sb3_mcbs.snapshot.errors import SnapshotMismatchError
-from sb3_mcbs.snapshot.graph import MISSING, Copier, Freezer, Thawer
+from sb3_mcbs.snapshot.graph import MISSING, Copier, Freezer, Ref, Thawer
 
 
 class GeneratorKind:
-    """Random generators."""
+    """Random generators, with the sequences that they spawn from."""
 
     name = "generator"
 
     def freeze(self, freezer: Freezer, obj: Any) -> Any:
-        return generators.kind_of_generator(obj), generators.classes_of(obj), generators.get_state(obj)
+        bits = generators.bits_of(obj)
+        classes = type(obj), type(bits)
+        kind = generators.kind_of(classes)
+        shared = freezer.owner_of(bits, obj)
+        if shared is not None:
+            return kind, classes, shared, None
+        return kind, classes, generators.get_state(bits), _freeze_seeds(freezer, bits, obj)
 
     def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
-        kind, classes, state = payload
-        same = generators.is_generator(current) and generators.kind_of_generator(current) == kind
-        reused = same and thawer.claim(current)
+        kind, classes, state, seeds = payload
+        if not generators.is_of_kind(current, kind):
+            current = MISSING
+        if type(state) is Ref:
+            return _over(generators.bits_of(thawer.thaw(state)), classes, current)
+        reused = _claim(thawer, current, seeds)
         generator = current if reused else generators.make_like(*classes)
+        sequence = None if seeds is None else generators.sequence_of(generator)
+        if type(seeds) is Ref:
+            shared = generators.sequence_of(thawer.thaw(seeds))
+            if shared is not None and shared is not sequence:
+                thawer.do_then(generators.use_sequence, generator, shared)
+            seeds = None
         if isinstance(thawer.rng, np.random.Generator):
-            thawer.do_then(generators.reseed, generator, thawer.rng)
-        elif thawer.rng == "restore":
-            thawer.do_then(generators.set_state, generator, state)
-        elif reused:
+            thawer.do_then(generators.reseed, generator, thawer.rng, seeds)
+            return generator
+        if thawer.rng == "keep":
+            if not reused:
+                return generator
             # An adapter may draw from it on the way, so that keeping it means to put it back.
-            thawer.do_then(generators.set_state, generator, generators.get_state(generator))
+            state = generators.get_state(generator)
+            seeds = None if seeds is None or sequence is None else generators.read_seeds(sequence)
+        thawer.do_then(generators.set_state, generator, state)
+        if seeds is not None and sequence is not None:
+            thawer.do_then(generators.set_seeds, sequence, seeds)
         return generator
 
     def copy(self, copier: Copier, obj: Any) -> Any:
-        generator = generators.make_like(*generators.classes_of(obj))
+        bits = generators.bits_of(obj)
+        if bits is not obj:
+            return type(obj)(copier.copy(bits))
+        generator = generators.make_like(type(obj), type(obj), copier.copy(generators.sequence_of(obj)))
         generators.set_state(generator, generators.get_state(obj))
         return generator
+
+
+def _freeze_seeds(freezer: Freezer, bits: Any, owner: Any) -> Any:
+    """Capture the sequence of a generator, or name the node that it is captured with."""
+    sequence = generators.sequence_of(bits)
+    if sequence is None:
+        return None
+    shared = freezer.owner_of(sequence, owner)
+    return generators.read_seeds(sequence) if shared is None else shared
+
+
+def _claim(thawer: Thawer, generator: Any, seeds: Any) -> bool:
+    """Return whether a generator is there that can be used, with all that it consists of."""
+    if generator is MISSING:
+        return False
+    bits = generators.bits_of(generator)
+    if not thawer.claim(bits):
+        return False
+    if type(seeds) is not tuple:
+        return True
+    sequence = generators.sequence_of(bits)
+    return sequence is not None and thawer.claim(sequence)
+
+
+def _over(bits: Any, classes: tuple[type, type], current: Any) -> Any:
+    """Return a generator that draws from the bit generator of another one."""
+    if classes[0] is classes[1]:
+        return bits
+    if current is not MISSING and generators.bits_of(current) is bits:
+        return current
+    return classes[0](bits)
+
+
+class SeedsKind:
+    """Sequences that random generators are spawned from."""
+
+    name = "seeds"
+
+    def freeze(self, freezer: Freezer, obj: np.random.SeedSequence) -> Any:
+        return _freeze_seeds(freezer, obj, obj)
+
+    def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
+        if type(payload) is Ref:
+            return generators.sequence_of(thawer.thaw(payload))
+        reused = type(current) is np.random.SeedSequence and thawer.claim(current)
+        sequence = current if reused else generators.make_sequence(payload)
+        if isinstance(thawer.rng, np.random.Generator):
+            thawer.do_then(_reseed_sequence, sequence, payload, thawer.rng)
+        elif thawer.rng == "restore":
+            thawer.do_then(generators.set_seeds, sequence, payload)
+        elif reused:
+            thawer.do_then(generators.set_seeds, sequence, generators.read_seeds(sequence))
+        return sequence
+
+    def copy(self, copier: Copier, obj: np.random.SeedSequence) -> Any:
+        return generators.make_sequence(generators.read_seeds(obj))
+
+
+def _reseed_sequence(
+    sequence: np.random.SeedSequence, seeds: generators.Seeds, rng: np.random.Generator
+) -> None:
+    generators.reseed_sequence(sequence, seeds, int(rng.integers(2**63)))
 
 
 class SpaceKind:

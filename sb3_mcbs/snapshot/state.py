@@ -14,6 +14,7 @@ from sb3_mcbs.snapshot.errors import SnapshotMismatchError, SnapshotUnsupportedE
 from sb3_mcbs.snapshot.graph import Copier, Freezer, Node, Ref, RngMode, Thawer
 from sb3_mcbs.snapshot.kinds import KINDS, kind_of, plan_adapter
 from sb3_mcbs.snapshot.layers import Layer, layers_of
+from sb3_mcbs.snapshot.objects import attributes_of, set_attributes
 from sb3_mcbs.snapshot.registry import SnapshotAdapter, find_adapter
 
 _NEEDS_RENDERING = "gymnasium.wrappers.transform_observation.AddRenderObservation"
@@ -88,7 +89,7 @@ class Stack:
         """Watch the simulators that are there now: a reset of the environment may exchange its own."""
         if not self.watches:
             return
-        present = {id(value) for layer in self._layers for value in vars(layer.env).values()}
+        present = {id(value) for layer in self._layers for value in attributes_of(layer.env).values()}
         if not all(id(obj) in present for obj in self._watched or ()):
             # Whoever takes a snapshot is told what cannot be captured.
             with contextlib.suppress(SnapshotUnsupportedError):
@@ -198,7 +199,7 @@ class Stack:
         copies[id(self._owner)] = below
         # Simulators first: attributes may be views into their memory.
         for layer in ordinary:
-            for value in vars(layer.env).values():
+            for value in attributes_of(layer.env).values():
                 kind = kind_of(value)
                 if kind is not None and kind.name == "adapter":
                     copier.copy(value)
@@ -220,8 +221,8 @@ def _short(names: list[str]) -> str:
 
 
 def _copy_attributes(copier: Copier, layer: Layer) -> None:
-    attributes = vars(copier.memo[id(layer.env)])
-    for name, value in vars(layer.env).items():
+    attributes: dict[str, Any] = {}
+    for name, value in attributes_of(layer.env).items():
         if name == "render_mode":
             attributes[name] = None
         elif name == "_ezpickle_kwargs" and "render_mode" in value:
@@ -234,6 +235,7 @@ def _copy_attributes(copier: Copier, layer: Layer) -> None:
             except SnapshotUnsupportedError as error:
                 error.path.insert(0, f"{type(layer.env).__name__}.{name}")
                 raise
+    set_attributes(copier.memo[id(layer.env)], attributes)
 
 
 @contextlib.contextmanager
