@@ -75,10 +75,7 @@ def print_environment(env_id: str, runs: list[Run]) -> None:
             values = [final_return(run, policy) for run in mine]
             cells += [", ".join(f"{value:.0f}" for value in values), interquartile_mean(values)]
         last = [run["evaluations"][-1] for run in mine]
-        cells += [
-            f"{np.mean([each['simulated_steps'] for each in last]) / 1e6:.2f}",
-            _minutes(last),
-        ]
+        cells += [_mean(last, "simulated_steps", 1e6, ".2f"), _mean(last, "training_seconds", 60, ".0f")]
         rows.append(cells)
     header = ["arm", "seeds"]
     for name in POLICIES.values():
@@ -86,9 +83,9 @@ def print_environment(env_id: str, runs: list[Run]) -> None:
     print_table([*header, "simulated steps, millions", "minutes of training"], rows)
 
 
-def _minutes(evaluations: list[dict[str, Any]]) -> str:
-    known = [each["training_seconds"] for each in evaluations if each["training_seconds"] is not None]
-    return f"{np.mean(known) / 60:.0f}" if known else "?"
+def _mean(evaluations: list[dict[str, Any]], name: str, unit: float, form: str) -> str:
+    known = [each[name] for each in evaluations if each[name] is not None]
+    return f"{np.mean(known) / unit:{form}}" if known else "?"
 
 
 def draw(env_id: str, runs: list[Run], arms: list[str], path: Path) -> None:
