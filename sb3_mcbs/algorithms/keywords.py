@@ -19,6 +19,7 @@ SETTINGS: tuple[type[CheckedSettings], ...] = (
     ValueExpansionSettings,
     EnsembleSettings,
 )
+SETTING_NAMES = frozenset(name for settings in SETTINGS for name in settings.names())
 
 _SEARCH_SETTINGS = "search_settings"
 

@@ -127,14 +127,12 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         del self._is_restored
         self._seed_at_setup = self.seed
         if self.search_rng is None:
-            self.search_rng = np.random.default_rng(self.seed)
+            self._seed_search(self.seed)
         if self._schedule is None:
             self._schedule = SearchSchedule(schedule, self.seed)
         self._schedule.settings = schedule
         if self.recent_actions is None and settings.proposal_dims is not None:
             self.recent_actions = RecentActions(get_action_dim(self.action_space))
-        if self.rollout_rng is None:
-            self.rollout_rng = stream(self.seed, "rollout replay")
         self._simulated_batches = SimulatedBatches(self)
         set_up_learned_model(self)
         if self.env is not None:
@@ -159,8 +157,10 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
 
     def set_random_seed(self, seed: int | None = None) -> None:
         super().set_random_seed(seed)
-        if seed is None or self._is_restored:
-            return
+        if seed is not None and not self._is_restored:
+            self._seed_search(seed)
+
+    def _seed_search(self, seed: int | None) -> None:
         self.search_rng = np.random.default_rng(seed)
         if self._schedule is not None:
             self._schedule.rng = stream(seed, "schedule")

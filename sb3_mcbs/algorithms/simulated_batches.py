@@ -26,7 +26,7 @@ class SimulatedBatches:
         RolloutReplaySettings.of(agent).check_search(agent.search_settings)
         expansion = ValueExpansionSettings.of(agent)
         expansion.check_search(agent.search_settings, agent.rollout_replay)
-        expansion.check_buffer(agent.replay_buffer)
+        expansion.check_buffer(agent.replay_buffer.optimize_memory_usage)
         self._expansion: ValueExpansion | None = None
         self._expansion_of: tuple[Any, Any] | None = None
         self._most_rollouts = agent.schedule_settings.most_rollouts(agent.search_settings)

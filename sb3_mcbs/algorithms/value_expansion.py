@@ -14,7 +14,6 @@ from typing import Any, cast
 import numpy as np
 from sb3_contrib import TQC
 from stable_baselines3 import SAC
-from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_mcbs.algorithms.mixed_batches import Outcome, Samples, as_samples
@@ -77,13 +76,13 @@ class ValueExpansionSettings(CheckedSettings):
                 f"together; got {rollout_replay} and {self.expanded_share}."
             )
 
-    def check_buffer(self, buffer: ReplayBuffer) -> None:
+    def check_buffer(self, optimize_memory_usage: bool) -> None:
         """Refuse replay buffers that do not keep what is needed.
 
-        :param buffer: the replay buffer.
+        :param optimize_memory_usage: as SB3's replay buffers have it.
         :raises ValueError: says which setting, and why.
         """
-        if self.value_expansion and buffer.optimize_memory_usage:
+        if self.value_expansion and optimize_memory_usage:
             raise ValueError(
                 "value_expansion goes on from the last observation of a transition, which a replay buffer "
                 "with optimize_memory_usage does not keep at the end of an episode: leave that out."

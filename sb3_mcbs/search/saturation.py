@@ -81,7 +81,8 @@ class Saturation:
         """
         kept = self._episodes[self._episodes[:, _END] > step - 2 * window]
         self._episodes = np.concatenate([kept, np.array(finished, dtype=float).reshape(-1, 4)])
-        self._note_since_change(finished)
+        since_change = [e for e in finished if self._since is not None and e.start >= self._since]
+        self._note_since_change(since_change)
         if self._baseline is None and step >= window and len(self._episodes) >= _LEAST:
             self._baseline = float(self._episodes[:, _TOTAL].mean())
         if self._since is None or self._baseline is None or step - self._since < window:
@@ -95,7 +96,7 @@ class Saturation:
         self._gain = max(self._gain, rise)
         settled = step - self._since >= 2 * window
         if self.is_reduced:
-            if settled and self._has_fallen(finished, comparable, last, recovery * self._gain):
+            if settled and self._has_fallen(since_change, comparable, last, recovery * self._gain):
                 self._change(step)
         elif settled:
             change = _difference(last, _means(before))
@@ -106,17 +107,16 @@ class Saturation:
 
     def _note_since_change(self, finished: Sequence[Episode]) -> None:
         for episode in finished:
-            if self._since is not None and episode.start >= self._since:
-                count, mean = self._since_change.get(episode.searched, (0, 0.0))
-                mean += (episode.total - mean) / (count + 1)
-                self._since_change[episode.searched] = count + 1, mean
+            count, mean = self._since_change.get(episode.searched, (0, 0.0))
+            mean += (episode.total - mean) / (count + 1)
+            self._since_change[episode.searched] = count + 1, mean
 
     def _has_fallen(
         self, finished: Sequence[Episode], comparable: np.ndarray, last: np.ndarray, least: float
     ) -> bool:
         """Whether returns have been lower than the best for so long that it is not chance.
 
-        :param finished: episodes that ended at this step.
+        :param finished: episodes that began after the last change and ended at this step.
         :param comparable: ``[n, 4]``, of the last two windows.
         :param last: ``[n, 4]``, of the last one.
         :param least: how much lower, at least.
@@ -126,7 +126,7 @@ class Saturation:
             mean -= _CAUTION * (variance / count) ** 0.5
             self._best[kind] = max(mean, self._best.get(kind, mean))
         for episode in finished:
-            if episode.start >= (self._since or 0) and episode.searched in self._best:
+            if episode.searched in self._best:
                 lacks = self._best[episode.searched] - episode.total - least
                 self._lacking = max(0.0, self._lacking + lacks)
         change = _difference(last, self._best)
@@ -144,8 +144,13 @@ def _means(episodes: np.ndarray) -> dict[bool, float]:
 
     :param episodes: ``[n, 4]``, as :class:`Episode`.
     """
+    return {kind: float(totals.mean()) for kind, totals in _returns(episodes).items()}
+
+
+def _returns(episodes: np.ndarray) -> dict[bool, np.ndarray]:
+    """The returns of each kind of episode, if there are enough of it."""
     by_kind = {kind: episodes[episodes[:, _SEARCHED] == kind, _TOTAL] for kind in (False, True)}
-    return {kind: float(totals.mean()) for kind, totals in by_kind.items() if len(totals) >= _LEAST}
+    return {kind: totals for kind, totals in by_kind.items() if len(totals) >= _LEAST}
 
 
 def _variance(episodes: np.ndarray) -> float:
@@ -153,9 +158,9 @@ def _variance(episodes: np.ndarray) -> float:
 
     :param episodes: ``[n, 4]``, as :class:`Episode`, two or more.
     """
-    means = _means(episodes)
-    away = [total - means.get(bool(kind), total) for total, kind in episodes[:, [_TOTAL, _SEARCHED]]]
-    return float(np.square(away).sum() / max(len(away) - len(means), 1))
+    returns = _returns(episodes)
+    squares = sum(float(np.square(totals - totals.mean()).sum()) for totals in returns.values())
+    return squares / max(len(episodes) - len(returns), 1)
 
 
 def _difference(episodes: np.ndarray, reference: dict[bool, float]) -> float | None:

@@ -1,15 +1,13 @@
 """Random numbers of one seed that have nothing to do with one another."""
 
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
-_PURPOSES = ("schedule", "rollout replay", "learned model")
+Purpose = Literal["schedule", "rollout replay", "learned model"]
 
 
-def stream(
-    seed: int | None, purpose: Literal["schedule", "rollout replay", "learned model"]
-) -> np.random.Generator:
+def stream(seed: int | None, purpose: Purpose) -> np.random.Generator:
     """Make a generator that has nothing in common with an environment of this seed, or with another purpose.
 
     ``np.random.default_rng(seed)`` is the generator of an environment that was reset with that seed: a
@@ -18,4 +16,4 @@ def stream(
     :param seed: ``None``: not reproducible.
     :param purpose: what it is for.
     """
-    return np.random.default_rng(None if seed is None else [seed, 1 + _PURPOSES.index(purpose)])
+    return np.random.default_rng(None if seed is None else [seed, 1 + get_args(Purpose).index(purpose)])

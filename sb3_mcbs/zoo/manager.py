@@ -13,7 +13,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_mcbs.algorithms.keywords import SETTINGS
+from sb3_mcbs.algorithms.keywords import SETTING_NAMES
 from sb3_mcbs.algorithms.rollout_replay import RolloutReplaySettings
 from sb3_mcbs.algorithms.value_expansion import ValueExpansionSettings
 from sb3_mcbs.checkpoints import CheckpointError, ExactCheckpointCallback
@@ -136,7 +136,7 @@ class MCBSExperimentManager(ExperimentManager):
         :raises optuna.TrialPruned: also where RL Zoo prunes
         """
         if self.algo in ALGORITHMS:
-            names = {"optimize_memory_usage", *(name for settings in SETTINGS for name in settings.names())}
+            names = {"optimize_memory_usage", *SETTING_NAMES}
             held = {name: value for name, value in self._hyperparams.items() if name in names}
             trial.set_user_attr(HELD, held)
         try:

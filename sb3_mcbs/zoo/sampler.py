@@ -14,7 +14,7 @@ from typing import Any
 
 import optuna
 
-from sb3_mcbs.algorithms.keywords import SETTINGS
+from sb3_mcbs.algorithms.keywords import SETTING_NAMES
 from sb3_mcbs.algorithms.rollout_replay import RolloutReplaySettings
 from sb3_mcbs.algorithms.value_expansion import ValueExpansionSettings
 from sb3_mcbs.search import ScheduleSettings, SearchSettings
@@ -173,8 +173,6 @@ def _why_senseless(params: dict[str, Any], sampled: dict[str, Any], n_actions: i
     drawn = sampled.get("n_simulations", 1)
     if params["rollout_depth"] == 0 and drawn > 1:
         return "nothing is simulated at rollout_depth 0, so n_simulations above 1 repeats another trial"
-    if params.get("value_expansion") and params.get("optimize_memory_usage"):
-        return "value_expansion does not go with optimize_memory_usage"
     if drawn > 1 and (params["n_simulations"] == 1 or params.get("rollout_noise") == 0):
         return "n_simulations above 1 needs a beam with noise in its rollouts, else it repeats another trial"
     if (params.get("proposal_dims") or 0) >= n_actions:
@@ -186,6 +184,7 @@ def _why_senseless(params: dict[str, Any], sampled: dict[str, Any], n_actions: i
         replay.check_search(settings)
         expansion = ValueExpansionSettings(**_of(params, ValueExpansionSettings))
         expansion.check_search(settings, replay.rollout_replay)
+        expansion.check_buffer(params.get("optimize_memory_usage", False))
     except ValueError as error:
         return str(error)
     if settings.simulated_steps(deterministic=False) > MAX_SIMULATED_STEPS:
@@ -204,7 +203,7 @@ def convert_mcbs_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     :param sampled_params: ``trial.params``
     :return: constructor arguments, as the sampler returned them
     """
-    search_names = {*_HELPERS, *(name for settings in SETTINGS for name in settings.names())}
+    search_names = {*_HELPERS, *SETTING_NAMES}
     search = _search_settings({name: v for name, v in sampled_params.items() if name in search_names})
     search |= _NO_PRESET
     others = {name: value for name, value in sampled_params.items() if name not in search_names}
