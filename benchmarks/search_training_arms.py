@@ -32,6 +32,8 @@ FADING: dict[str, Any] = {
 #: Targets of 3 steps, of which two are simulated, for half of every batch.
 EXPANSION: dict[str, Any] = {"value_expansion": 2}
 ON_TOP: dict[str, Any] = {"action_noise_after_search": True}
+#: Three times as many candidates at first.
+WIDE_EARLY: dict[str, Any] = {"beam_width": 18, "search_schedule": "anneal", "final_beam_width": 6}
 
 ARMS: dict[str, tuple[type[TD3], dict[str, Any]]] = {
     "td3": (PlainTD3, {}),
@@ -59,4 +61,5 @@ ARMS: dict[str, tuple[type[TD3], dict[str, Any]]] = {
     "efficient_expansion": (MCBSTD3, EFFICIENT | EXPANSION),
     "anneal_expansion": (MCBSTD3, EFFICIENT | EXPANSION | FADING),
     "half_noise_expansion": (MCBSTD3, EFFICIENT | HALF | EXPANSION | ON_TOP),
+    "half_wide_expansion": (MCBSTD3, EFFICIENT | HALF | EXPANSION | WIDE_EARLY),
 }
