@@ -171,6 +171,20 @@ def test_a_preset_of_the_command_line_goes_before_the_file(
     assert (agent.preset, agent.search_settings) == ("strong", settings)
 
 
+def test_the_papers_preset_takes_noise_from_searched_actions(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = {"n_timesteps": 120, "policy": "MlpPolicy", "action_noise_after_search": True, "search_share": 0.5}
+    (tmp_path / "own.yml").write_text(
+        yaml.safe_dump({"Pendulum-v1": {**file, "noise_type": "normal", "noise_std": 0.1}})
+    )
+    for preset, noisy in {"efficient": True, "paper": False}.items():
+        words = ("-conf", "own.yml", "--eval-freq", "-1", "-f", preset)
+        zoo_train(monkeypatch, tmp_path, "mcbs_td3", *words, "-params", *TINY, f"preset:'{preset}'")
+        agent = MCBSTD3.load(tmp_path / preset / "mcbs_td3" / "Pendulum-v1_1" / "Pendulum-v1.zip")
+        assert (agent.action_noise_after_search, agent.search_share) == (noisy, 0.5 if noisy else 1)
+
+
 @pytest.mark.parametrize("preset", ["paper", "strong"])
 def test_a_preset_replaces_what_the_file_says_of_the_search(
     preset: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

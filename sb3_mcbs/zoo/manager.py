@@ -189,7 +189,7 @@ def _settings_of_preset(name: str) -> dict[str, Any]:
 
     :param name: of the preset
     :return: every setting of how is searched; for "paper", which is Algorithm 1 at every step, also those of
-        when is searched and what is learned from simulations
+        when is searched, what is learned from simulations and whether searched actions get noise
     """
     settings = asdict(SearchSettings.preset(name))
     for setting in OF_THE_MACHINE:
@@ -197,6 +197,7 @@ def _settings_of_preset(name: str) -> dict[str, Any]:
     if name == "paper":
         for defaults in (ScheduleSettings(), RolloutReplaySettings(), ValueExpansionSettings()):
             settings |= asdict(defaults)
+        settings["action_noise_after_search"] = False
     return settings
 
 
