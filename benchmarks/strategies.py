@@ -5,12 +5,14 @@ seeds and reported on another:
 
     python -m benchmarks.strategies sac-HalfCheetah-v3.zip HalfCheetah-v4 --seeds choosing
     python -m benchmarks.strategies sac-HalfCheetah-v3.zip HalfCheetah-v4 --seeds reporting
+    python -m benchmarks.strategies sac-Walker2d-v3.zip Walker2d-v4 --seeds confirming --arms "beam 6x3"
     python -m benchmarks.strategies --table
 
 The second runs what was best of each strategy and budget in the first, and the presets. Arms are named by
 their sizes: beam candidates x depth, tree width x branching x depth, refine width x rounds x depth; (2x3) is
 a depth of 2 macro-steps of 3 steps, "in 2" two directions, "of 48" critic pre-selection, "soft"
-entropy_bonus, "truncated" tqc_value. Arms that the file of results holds already are left out.
+entropy_bonus, "truncated" tqc_value. Arms that the file of results holds already are left out. The third runs
+a hundred episodes, for agents that fall in some: ten say little of them.
 """
 
 import argparse
@@ -18,6 +20,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import torch as th
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -32,7 +35,7 @@ from sb3_mcbs.search import PRESETS
 
 FILE = "strategies"
 FIGURE = RESULTS.parents[1] / "docs" / "images" / "strategies.png"
-SEEDS = {"choosing": range(100, 102), "reporting": range(200, 210)}
+SEEDS = {"choosing": range(100, 102), "reporting": range(200, 210), "confirming": range(300, 400)}
 #: On whose choosing seeds the arms that are reported of every agent were chosen.
 CHOSEN_WITH = "sac-HalfCheetah-v3"
 
@@ -139,19 +142,26 @@ def by_cost(arms: list[str]) -> list[str]:
     return sorted(arms, key=lambda arm: SearchSettings(**ARMS[arm]).simulated_steps())
 
 
+def ended_early(row: dict[str, Any]) -> int:
+    """How many episodes of an arm did not last until the time limit."""
+    limit = gym.spec(row["environment"]).max_episode_steps or np.inf
+    return sum(length < limit for length in row["lengths"])
+
+
 def show(rows: list[dict[str, Any]]) -> None:
     """Print a table for every agent and set of seeds."""
-    header = ["", "return", "least", "most", "simulated steps", "critic evaluations", "cpu ms",
+    header = ["", "return", "least", "most", "ended early", "simulated steps", "critic evaluations", "cpu ms",
               "predicted", "predicted - realised"]  # fmt: skip
     for agent, seeds in dict.fromkeys((row["agent"], row["seeds"]) for row in rows):
         table = [
             [row["arm"], float(np.mean(row["returns"])), min(row["returns"]), max(row["returns"]),
-             *(float(row.get(name, "nan")) for name in header[4:8]), row["predicted"] - row["realised"]]
+             ended_early(row),
+             *(float(row.get(name, "nan")) for name in header[5:9]), row["predicted"] - row["realised"]]
             for row in rows
             if (row["agent"], row["seeds"]) == (agent, seeds)
         ]  # fmt: skip
-        print(f"\n{agent}, {seeds} seeds {list(SEEDS[seeds])}\n")
-        print_table(header, sorted(table, key=lambda line: (round(line[4], -1), line[1])))
+        print(f"\n{agent}, {seeds} seeds {SEEDS[seeds][0]} to {SEEDS[seeds][-1]}\n")
+        print_table(header, sorted(table, key=lambda line: (round(line[5], -1), line[1])))
 
 
 def draw(rows: list[dict[str, Any]], path: Path) -> None:
@@ -169,7 +179,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
     for panel in panels[len(agents) :]:
         panel.set_axis_off()
     for agent, panel in zip(agents, panels, strict=False):
-        of_agent = [row for row in rows if row["agent"] == agent]
+        of_agent = [row for row in rows if row["agent"] == agent and row["seeds"] != "confirming"]
         actor = [np.mean(row["returns"]) for row in of_agent if row["arm"] == "actor alone"][-1]
         panel.axhline(actor, color="grey", linestyle=":", label="actor alone")
         for strategy, marker, color in (("beam", "o", "C0"), ("tree", "^", "C1"), ("refine", "s", "C2")):
