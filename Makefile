@@ -13,7 +13,7 @@ help:
 	@echo "make lint       ruff and mypy"
 	@echo "make format     ruff format, and what ruff check can repair"
 	@echo "make bench-search and other measurements: see docs/speed.md and docs/checkpoints.md"
-	@echo "make evidence   TD3 against MCBS-TD3, three seeds each (about an hour on two cores)"
+	@echo "make evidence   TD3 against MCBS-TD3, three seeds each (two hours or more on two cores)"
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)

@@ -24,8 +24,8 @@ class MCBSDDPG(MCBS, FastUpdate, DDPG):
     ``predict`` is the actor alone, without search, as for every SB3 algorithm: it needs no environment.
     To act with search use :class:`~sb3_mcbs.SearchPolicy`.
 
-    The environments are wrapped in :class:`~sb3_mcbs.SnapshotEnvWrapper` by the algorithm, except in a
-    ``SubprocVecEnv``, whose environments must be wrapped when they are made.
+    What is simulated needs environments in :class:`~sb3_mcbs.SnapshotEnvWrapper`: the algorithm wraps them
+    itself, except in a ``SubprocVecEnv``, where they must be wrapped when they are made.
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy)
     :param env: The environment to learn from (if registered in Gymnasium, can be str)
@@ -40,8 +40,9 @@ class MCBSDDPG(MCBS, FastUpdate, DDPG):
     :param train_freq: Update the model every ``train_freq`` steps, or a tuple like ``(5, "step")`` or
         ``(2, "episode")``
     :param gradient_steps: How many gradient steps to do after each rollout; -1 means as many as steps done
-    :param action_noise: noise on actions chosen without search (before ``learning_starts``). Searched
-        actions are executed as they are unless ``action_noise_after_search`` is set.
+    :param action_noise: noise on actions chosen without search (before ``learning_starts`` and where
+        the schedule leaves the search out). Searched actions are executed as they are unless
+        ``action_noise_after_search`` is set.
     :param replay_buffer_class: Replay buffer class to use (for instance ``HerReplayBuffer``)
     :param replay_buffer_kwargs: Keyword arguments to pass to the replay buffer on creation
     :param optimize_memory_usage: Enable a memory efficient variant of the replay buffer

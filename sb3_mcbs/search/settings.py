@@ -50,7 +50,7 @@ class SearchSettings(CheckedSettings):
         evaluated in rounds while the next is expected to finish in time, and the results depend on how fast
         the machine is. ``None``: all candidates, however long it takes, and reproducible to the bit.
     :param max_beam_width: with ``time_budget``, the number of candidates that is enough; ``None``:
-        ``beam_width``, which may be left idle time.
+        ``beam_width``, which may leave time unused.
     :param strategy: ``"beam"`` (Algorithm 1), ``"tree"`` (the best ``beam_width`` nodes of every depth grow
         ``branching`` children each) or ``"refine"`` (``n_rounds`` of ``beam_width`` plans, each round around
         the best so far).
