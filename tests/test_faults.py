@@ -4,6 +4,7 @@ import os
 import signal
 import time
 import warnings
+from contextlib import nullcontext
 from pathlib import Path
 
 import gymnasium as gym
@@ -141,6 +142,35 @@ def test_divergence_leaves_normalisation_in_order(make_agent) -> None:
     assert np.abs(agent.replay_buffer.rewards).max() < 1e3
     observation = agent.replay_buffer.observations[25, 0]
     assert np.abs(observation[:8]).max() <= 0.1, "the next row is a first observation, not normalised"
+
+
+class Stop(BaseCallback):
+    """Ends the training at a step, or breaks it off as Ctrl-C does."""
+
+    def __init__(self, at: int, broken_off: bool) -> None:
+        super().__init__()
+        self.at, self.broken_off = at, broken_off
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps == self.at and self.broken_off:
+            raise KeyboardInterrupt
+        return self.num_timesteps != self.at
+
+
+@pytest.mark.parametrize("broken_off", [False, True])
+@pytest.mark.parametrize("settings", [{}, dict(n_steps=3), dict(search_share=0.5, search_unit="episode")])
+def test_training_that_a_callback_stopped_can_go_on(make_agent, settings: dict, broken_off: bool) -> None:
+    """Also where an episode ends in that step, which SB3 does not store."""
+    env = VecNormalize(snapshot_vec_env("Pendulum-v1", 2, env_kwargs={"max_episode_steps": 25}))
+    agent = make_agent(env, **settings)
+    for at in (44, 50, 96):
+        with pytest.raises(KeyboardInterrupt) if broken_off else nullcontext():
+            agent.learn(60, callback=Stop(at, broken_off), reset_num_timesteps=False)
+        assert (agent.num_timesteps, agent._schedule._starts.tolist()) == (at, [50 * (at // 50)] * 2)
+    agent.learn(60, reset_num_timesteps=False)
+    buffer = agent.replay_buffer
+    assert buffer.pos * 2 == agent.num_timesteps - 3 * 2, "the three steps are not stored"
+    assert buffer.dones[[20, 22, 44]].all() and buffer.timeouts[[20, 22, 44]].all()
 
 
 def test_a_monitor_that_forbids_early_resets(tmp_path: Path) -> None:

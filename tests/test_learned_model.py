@@ -115,7 +115,7 @@ def test_it_is_put_aside_while_its_error_is_too_high(learning_agent):
 
 def test_an_agent_without_noise_explores_until_the_model_is_ready(learning_agent):
     agent = learning_agent(ensemble_max_error=0.0, beam_noise=0.2).learn(101)
-    assert agent.action_noise._sigma == pytest.approx(0.2)
+    assert agent._noise_without_search._sigma == pytest.approx(0.2)
 
 
 def test_time_limits_are_no_terminations():

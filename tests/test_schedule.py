@@ -298,20 +298,30 @@ def test_searched_rows_are_executed_as_they_were_simulated(make_agent):
 
 @pytest.mark.parametrize("cls", SEARCHING)
 def test_noise_after_the_search_needs_noise(make_agent, cls):
-    with pytest.raises(ValueError, match="pass an action_noise"):
-        make_agent(cls=cls, action_noise_after_search=True).learn(1)
-    if WITHOUT_SEARCH[cls].__name__ in ("TD3", "DDPG"):  # given some for what is not searched
-        make_agent(cls=cls, action_noise_after_search=True, search_share=0.5).learn(30)
+    for share in (1, 0.5):
+        with pytest.raises(ValueError, match="pass an action_noise"):
+            make_agent(cls=cls, action_noise_after_search=True, search_share=share).learn(1)
 
 
 def test_a_deterministic_actor_without_noise_explores_by_the_beams(make_agent, capsys):
     agent = make_agent(search_share=0.5, verbose=1)
     agent.learn(60)
     assert "Gaussian noise of beam_noise=0.1" in capsys.readouterr().out
-    assert agent.action_noise._sigma.tolist() == [0.1]
-    for other in (make_agent(), make_agent(cls=MCBSSAC, search_share=0.5)):
+    given = make_agent(search_share=0.5, action_noise=NormalActionNoise(np.zeros(1), np.full(1, 0.1)))
+    assert_same_parameters(agent, given.learn(60))
+    for other in (make_agent(verbose=1), make_agent(cls=MCBSSAC, search_share=0.5, verbose=1)):
         other.learn(30)
-        assert other.action_noise is None
+        assert "Gaussian noise" not in capsys.readouterr().out
+
+
+def test_noise_for_what_is_not_searched_is_not_saved(make_agent, tmp_path):
+    """An agent that was given none goes on with other environments, and with another beam_noise."""
+    make_agent(snapshot_vec_env("Pendulum-v1", 2), search_share=0.0).learn(60).save(tmp_path / "agent")
+    for n_envs in (1, 3):
+        agent = MCBSTD3.load(tmp_path / "agent", snapshot_vec_env("Pendulum-v1", n_envs), beam_noise=0.4)
+        drawn = agent.learn(60)._noise_without_search()
+        assert agent.action_noise is None and drawn.size == n_envs
+        assert 0.1 < np.std([agent._noise_without_search() for _ in range(200)]) < 0.6
 
 
 def test_what_is_logged(make_agent):

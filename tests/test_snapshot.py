@@ -267,9 +267,24 @@ def test_monitor_is_restored_and_left_out_of_clones(tmp_path):
     assert monitor.rewards == rewards and not monitor.needs_reset
     again = [env.step(action) for action in actions[3:]]
     assert again[-1][4]["episode"]["r"] == results[-1][4]["episode"]["r"]
-    with pytest.raises(SnapshotMismatchError, match="Monitor"):
-        env.restore(clone.snapshot())
+    for without in (clone.snapshot(), env.snapshot(monitor=False)):
+        with pytest.raises(SnapshotMismatchError, match="Monitor"):
+            env.restore(without)
     env.close()
+
+
+def test_what_a_monitor_remembers_can_be_left_out():
+    """Its history grows with every episode, and so would the price of a pool's decisions."""
+    env = make("Pendulum-v1", NormalizeObservation, Monitor, NormalizeReward, max_episode_steps=3)
+    clone, sizes = env.clone(), []
+    for seed in range(40):
+        env.reset(seed=seed)
+        state = env.snapshot(monitor=False)
+        sizes.append(len(pickle.dumps(state)))
+        clone.restore(state)
+        steps = [follow(each, actions_for(env, 3)) for each in (env, clone)]
+        assert [step[:4] for step in steps[0]] == [step[:4] for step in steps[1]]  # Monitor adds to the info
+    assert len(env.get_wrapper_attr("episode_returns")) == 40 and max(sizes) < sizes[0] + 50
 
 
 def test_clone_touches_nothing(tmp_path, monkeypatch):

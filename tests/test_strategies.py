@@ -79,6 +79,7 @@ WORLDS = {
     "endless": dict(),
     "terminates": dict(limit=1.4),
     "terminates-at-once": dict(limit=0.5),
+    "terminates-everywhere": dict(limit=0.0),
     "diverges": dict(bad_action=0.2),
     "both": dict(limit=1.3, bad_action=0.4),
     "hopeless": dict(bad_action=-2.0),
@@ -281,6 +282,17 @@ def test_a_tree_in_a_random_world_follows_the_mean():
     with pytest.raises(ValueError, match="n_simulations of 2 or more"):
         check_dynamics(single, deterministic=False)
     check_dynamics(single, deterministic=True)
+
+
+def test_a_tree_of_proposals_stops_where_every_node_has_terminated(make_agent):
+    env = snapshot_vec_env("InvertedPendulum-v5")
+    agent = make_agent(env, strategy="tree", beam_width=2, branching=2, n_proposals=8, rollout_depth=6)
+    policy = SearchPolicy(agent, env, beam_noise=0.5, seed=0)
+    observations = env.reset()
+    env.env_method("set_state", np.array([0.0, 0.199]), np.array([0.0, 2.0]))
+    env.envs[0].last_observation = observations = env.env_method("_get_obs")[0]
+    policy.predict(observations[None])
+    assert policy.last_result.chosen[0] >= 0 and policy.last_result.simulated_steps == 4
 
 
 def test_one_node_per_root_keeps_as_many_roots_as_nodes():

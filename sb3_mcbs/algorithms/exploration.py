@@ -5,20 +5,20 @@ import logging
 import numpy as np
 from sb3_contrib import TQC
 from stable_baselines3 import SAC
-from stable_baselines3.common.noise import ActionNoise, NormalActionNoise
+from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 logger = logging.getLogger("sb3_mcbs")
 
 
-def explore_without_search(agent: OffPolicyAlgorithm, noise: float) -> None:
-    """Give a deterministic actor noise for what is not searched, if it has none.
+def noise_without_search(agent: OffPolicyAlgorithm, noise: float) -> ActionNoise | None:
+    """The noise of a deterministic actor for what is not searched, if it has none of its own.
 
     :param agent: an agent that does not search at every step.
     :param noise: standard deviation of Gaussian noise, in the action space scaled to [-1, 1].
     """
     if agent.action_noise is not None or isinstance(agent, SAC | TQC):
-        return
+        return None
     message = (
         "action_noise is None, and not every decision is searched: where the actor acts, Gaussian noise of "
         f"beam_noise={noise} is added. Pass an action_noise to choose another."
@@ -27,7 +27,8 @@ def explore_without_search(agent: OffPolicyAlgorithm, noise: float) -> None:
     if agent.verbose >= 1:
         print(message)
     shape = agent.action_space.shape or ()
-    agent.action_noise = NormalActionNoise(np.zeros(shape), np.full(shape, noise))
+    gaussian = NormalActionNoise(np.zeros(shape), np.full(shape, noise))
+    return VectorizedActionNoise(gaussian, agent.n_envs) if agent.n_envs > 1 else gaussian
 
 
 class DrawnNoise(ActionNoise):

@@ -65,10 +65,13 @@ class CheckedVecEnv(VecEnvWrapper):
     """Environments whose observations and rewards are checked before anyone else sees them.
 
     :param venv: the environments, with all their wrappers.
+
+    :ivar unstored: observations, rewards and dones of the last step, until it is stored.
     """
 
     def __init__(self, venv: VecEnv) -> None:
         super().__init__(venv)
+        self.unstored: tuple[Any, np.ndarray, np.ndarray] | None = None
         self._normalizer = unwrap_vec_normalize(venv)
         self._workers = venv.unwrapped if isinstance(venv.unwrapped, SubprocVecEnv) else None
         self._actions = np.zeros(0)
@@ -92,11 +95,13 @@ class CheckedVecEnv(VecEnvWrapper):
             await_answers(self._workers, range(self.num_envs))
         result = self.venv.step_wait()
         observations, rewards, dones, infos = result
+        self.unstored = observations, rewards, dones
         if normalizer is not None:
             observations, rewards = normalizer.old_obs, normalizer.old_reward
         reason = _what_is_not_finite(observations, rewards, dones, infos)
         if reason is None:
             return result
+        self.unstored = None
         if before is not None:
             before.put_back()
         env_index, what = reason

@@ -13,7 +13,7 @@ from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_mcbs.algorithms.exploration import DrawnNoise, explore_without_search
+from sb3_mcbs.algorithms.exploration import DrawnNoise, noise_without_search
 from sb3_mcbs.algorithms.faults import (
     CheckedVecEnv,
     check_observations,
@@ -98,6 +98,7 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         self._simulated_batches: SimulatedBatches | None = None
         self.learned_model: LearnedModel | None = None
         self._checked_env: CheckedVecEnv | None = None
+        self._noise_without_search: ActionNoise | None = None
 
     @property
     def search_settings(self) -> SearchSettings:
@@ -188,6 +189,7 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         self._simulated_batches.look()
         self._decision = self._rollouts = None
         # For all environments whatever is searched, so that random streams do not depend on the schedule.
+        action_noise = action_noise or self._noise_without_search
         noise = None if action_noise is None else DrawnNoise(action_noise)
         try:
             actions, scaled_actions = super()._sample_action(learning_starts, noise, n_envs)
@@ -250,10 +252,8 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
-        normalizer = self._vec_normalize_env
-        raw_reward = reward if normalizer is None else normalizer.get_original_reward()
-        assert self._schedule is not None and self._searcher is not None
-        self._schedule.note_step(raw_reward, dones, self.num_timesteps)
+        raw_reward = self._note_step(reward, dones)
+        assert self._searcher is not None
         diverged = diverged_environments(infos)
         if diverged and self.n_diverged_steps == 0:
             warn_of_divergence(buffer_action, diverged, self.num_timesteps)
@@ -273,10 +273,27 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         self._simulated_batches.store(replay_buffer.pos, self._rollouts, dones)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
+    def _note_step(self, reward: np.ndarray, dones: np.ndarray) -> np.ndarray:
+        """Tell the schedule of a step, and return its rewards as the environments gave them."""
+        assert self._schedule is not None and self._checked_env is not None
+        self._checked_env.unstored = None
+        normalizer = self._vec_normalize_env
+        raw_reward = reward if normalizer is None else normalizer.get_original_reward()
+        self._schedule.note_step(raw_reward, dones, self.num_timesteps)
+        return raw_reward
+
     def collect_rollouts(self, env: VecEnv, *args: Any, **kwargs: Any) -> RolloutReturn:
         if self._checked_env is None or self._checked_env.venv is not env:
             self._checked_env = CheckedVecEnv(env)
-        return super().collect_rollouts(self._checked_env, *args, **kwargs)
+        try:
+            return super().collect_rollouts(self._checked_env, *args, **kwargs)
+        finally:
+            # SB3 does not store the step in which a callback stops the training, but training may go on.
+            if self._checked_env.unstored is not None:
+                new_obs, reward, dones = self._checked_env.unstored
+                self._note_step(reward, dones)
+                assert self.replay_buffer is not None
+                leave_out_step(self, self.replay_buffer, new_obs)
 
     def _setup_learn(
         self,
@@ -287,7 +304,7 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         **kwargs: Any,
     ) -> tuple[int, BaseCallback]:
         if not self.schedule_settings.searches_always or self.learned_model is not None:
-            explore_without_search(self, self.beam_noise)
+            self._noise_without_search = noise_without_search(self, self.beam_noise)
         if self.action_noise_after_search and self.action_noise is None:
             raise ValueError(
                 "action_noise_after_search adds action_noise to searched actions, and there is none: pass an "
@@ -408,5 +425,6 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         return super().predict(observation, state, episode_start, deterministic)
 
     def _excluded_save_params(self) -> list[str]:
-        transient = ["_searcher", "_decision", "_rollouts", "_checked_env", "_simulated_batches"]
+        transient = ["_searcher", "_decision", "_rollouts", "_checked_env", "_simulated_batches",
+                     "_noise_without_search"]  # fmt: skip
         return [*super()._excluded_save_params(), *transient]

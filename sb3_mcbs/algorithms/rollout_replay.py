@@ -7,6 +7,7 @@ were really visited, from rewards of the exact simulator. Rollouts are stored be
 the transition of the same step, in arrays of their own: they are never taken for experience.
 """
 
+import logging
 from dataclasses import dataclass
 from operator import itemgetter
 from typing import Any, cast
@@ -22,6 +23,8 @@ from sb3_mcbs.models.base import Observations
 from sb3_mcbs.search import Rollouts, SearchSettings
 from sb3_mcbs.search.checks import CheckedSettings
 from sb3_mcbs.search.interface import map_arrays, put_rows
+
+logger = logging.getLogger("sb3_mcbs")
 
 #: Below this share of places that hold a rollout they are looked up, above it they are found by trying.
 _SPARSE = 0.02
@@ -90,6 +93,15 @@ class RolloutReplay:
         held = getattr(buffer, "rollout_rewards", None)
         if held is not None and held.shape == (*shape, rollout_depth):
             return
+        if held is not None and self.buffer.rollout_count:
+            logger.warning(
+                "The %d rollouts of the replay buffer are dropped: they are %d of %d steps per decision, and "
+                "the search now has %d of %d.",
+                self.buffer.rollout_count,
+                *held.shape[2:],
+                n_rollouts,
+                rollout_depth,
+            )
         self.buffer.rollout_actions = np.zeros((*shape, buffer.action_dim), dtype=np.float32)
         self.buffer.rollout_rewards = np.zeros((*shape, rollout_depth), dtype=np.float32)
         self.buffer.rollout_lengths = np.zeros(shape, dtype=np.int32)

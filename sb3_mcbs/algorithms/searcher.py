@@ -336,7 +336,8 @@ class Searcher:
             raise ValueError(
                 "The observations to act on are not those of the environments' present states. A search "
                 "plans from the environments it was given: act in those, step them only through their "
-                "SnapshotEnvWrapper, and keep wrappers that alter observations inside it."
+                "SnapshotEnvWrapper, and keep wrappers that alter observations inside it. If they were used "
+                "for something else between two calls of learn, call set_env before the second."
             )
         return stacked
 

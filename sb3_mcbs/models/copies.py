@@ -219,5 +219,5 @@ def drop_copies(wrapper: SnapshotEnvWrapper, pool: str) -> None:
 
 
 def read_snapshot(wrapper: SnapshotEnvWrapper) -> Snapshot:
-    """The environment's present state."""
-    return wrapper.snapshot()
+    """The environment's present state, for copies of it."""
+    return wrapper.snapshot(monitor=False)

@@ -139,9 +139,9 @@ def tree_search(
     for depth in range(settings.rollout_depth):
         children = n_roots if depth == 0 else settings.branching
         drawn = noise.roots if depth == 0 else noise.later[depth - 1]
-        actions, offsets = _children(nodes, view, drawn, children, agent, settings)
-        if not len(actions):
+        if not (nodes.rows >= 0).any():
             break
+        actions, offsets = _children(nodes, view, drawn, children, agent, settings)
         parents = np.repeat(nodes.rows, children, axis=2)
         parents = parents[parents >= 0]
         if depth == 0:

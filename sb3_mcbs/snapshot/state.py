@@ -26,7 +26,8 @@ class FrozenLayer(NamedTuple):
     :param name: its class.
     :param monitor: whether it is SB3's ``Monitor``, which may be missing where the state is put back.
     :param adapted: what the layer's adapter captured, in a tuple; None if it has no adapter.
-    :param attributes: the frozen value of each captured attribute; None if none are captured.
+    :param attributes: the frozen value of each captured attribute; None if none are captured, as of a
+        ``Monitor`` that was left out.
     """
 
     name: str
@@ -74,14 +75,23 @@ class Stack:
         """Whether a clone is not yet in the state of the original."""
         return any(adapter.with_attributes for adapter in self._adapters.values())
 
-    def freeze(self) -> tuple[tuple[FrozenLayer, ...], tuple[Node, ...]]:
+    def freeze(self, monitor: bool = True) -> tuple[tuple[FrozenLayer, ...], tuple[Node, ...]]:
         """Capture the state.
 
+        :param monitor: whether what a ``Monitor`` holds is captured.
         :return: the captured layers, outermost first, and the nodes that their values refer to.
         :raises SnapshotUnsupportedError: if a layer holds something that cannot be captured.
         """
         freezer = Freezer(kind_of, self._refs, len(self._stateful))
-        frozen = tuple([self._freeze_layer(freezer, layer) for layer in self._stateful])
+        # A Monitor that is left out keeps its place, which nodes refer to.
+        frozen = tuple(
+            [
+                self._freeze_layer(freezer, layer)
+                if monitor or not layer.monitor
+                else FrozenLayer(layer.name, True, None, None)
+                for layer in self._stateful
+            ]
+        )
         self._watch(freezer.adapted)
         return frozen, tuple(freezer.nodes)
 
@@ -125,7 +135,9 @@ class Stack:
         :param frozen: captured layers.
         :raises SnapshotMismatchError: names the difference.
         """
-        if self._names == [layer.name for layer in frozen]:
+        monitors = [layer for layer in frozen if layer.monitor]
+        captured = [layer for layer in monitors if layer.attributes is not None]
+        if captured == monitors and self._names == [layer.name for layer in frozen]:
             return
         ours = [layer.name for layer in self._stateful if not layer.monitor]
         theirs = [layer.name for layer in frozen if not layer.monitor]
@@ -138,8 +150,7 @@ class Stack:
                 "The wrappers differ, outermost first: "
                 f"{_short(theirs)} in the snapshot, {_short(ours)} around this environment."
             )
-        n_ours, n_theirs = len(self._stateful) - len(ours), len(frozen) - len(theirs)
-        if n_ours > n_theirs:
+        if len(self._stateful) - len(ours) > len(captured):
             raise SnapshotMismatchError(
                 "This environment has a Monitor, and the snapshot is of one without: the episode in progress "
                 "that the Monitor should continue is not in it. Restore it into a clone() instead."

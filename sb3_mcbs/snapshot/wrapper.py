@@ -110,13 +110,15 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
                 return diverged_step(result, self._stack.monitors)
         return result
 
-    def snapshot(self) -> Snapshot:
+    def snapshot(self, monitor: bool = True) -> Snapshot:
         """Capture the present state.
 
+        :param monitor: whether what SB3's ``Monitor`` holds is captured. It grows with every episode, and a
+            ``clone()`` has no use for it; without it the snapshot can be restored into those alone.
         :raises SnapshotUnsupportedError: if something that came up since the environment was wrapped
             cannot be captured.
         """
-        layers, nodes = self._stack.freeze()
+        layers, nodes = self._stack.freeze(monitor)
         return Snapshot(layers, nodes, self._spaces, private_copy(self.last_observation))
 
     def restore(self, snapshot: Snapshot, rng: RngMode = "restore") -> None:
