@@ -224,6 +224,16 @@ def test_rollouts_are_saved_with_the_replay_buffer(make_agent, tmp_path, cls):
     loaded.learn(30, reset_num_timesteps=False)
 
 
+def test_rollouts_of_another_size_are_not_dropped_silently(make_agent, tmp_path, caplog):
+    agent = make_agent(rollout_replay=0.5).learn(60)
+    agent.save(tmp_path / "agent")
+    agent.save_replay_buffer(tmp_path / "buffer")
+    loaded = MCBSTD3.load(tmp_path / "agent", env=snapshot_vec_env("Pendulum-v1"), beam_width=2)
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    loaded.learn(30, reset_num_timesteps=False)
+    assert "rollouts of the replay buffer are dropped" in caplog.text
+
+
 @pytest.mark.parametrize(
     "cls, env_id, n_envs, size",
     [(MCBSTD3, "InvertedPendulum-v5", 2, 2000), *((cls, "Pendulum-v1", 1, 100) for cls in SEARCHING)],
