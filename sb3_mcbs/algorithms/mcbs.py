@@ -189,8 +189,8 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         self._simulated_batches.look()
         self._decision = self._rollouts = None
         # For all environments whatever is searched, so that random streams do not depend on the schedule.
-        action_noise = action_noise or self._noise_without_search
-        noise = None if action_noise is None else DrawnNoise(action_noise)
+        drawn_from = self._noise_without_search if action_noise is None else action_noise
+        noise = None if drawn_from is None else DrawnNoise(drawn_from)
         try:
             actions, scaled_actions = super()._sample_action(learning_starts, noise, n_envs)
         except ValueError:  # of torch: a stochastic actor cannot sample where its mean is NaN
