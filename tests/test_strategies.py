@@ -288,10 +288,10 @@ def test_a_tree_of_proposals_stops_where_every_node_has_terminated(make_agent):
     env = snapshot_vec_env("InvertedPendulum-v5")
     agent = make_agent(env, strategy="tree", beam_width=2, branching=2, n_proposals=8, rollout_depth=6)
     policy = SearchPolicy(agent, env, beam_noise=0.5, seed=0)
-    observations = env.reset()
+    env.reset()
     env.env_method("set_state", np.array([0.0, 0.199]), np.array([0.0, 2.0]))
-    env.envs[0].last_observation = observations = env.env_method("_get_obs")[0]
-    policy.predict(observations[None])
+    env.envs[0].last_observation = observation = env.env_method("_get_obs")[0]
+    policy.predict(observation[None])
     assert policy.last_result.chosen[0] >= 0 and policy.last_result.simulated_steps == 4
 
 

@@ -95,13 +95,12 @@ class CheckedVecEnv(VecEnvWrapper):
             await_answers(self._workers, range(self.num_envs))
         result = self.venv.step_wait()
         observations, rewards, dones, infos = result
-        self.unstored = observations, rewards, dones
         if normalizer is not None:
             observations, rewards = normalizer.old_obs, normalizer.old_reward
         reason = _what_is_not_finite(observations, rewards, dones, infos)
         if reason is None:
+            self.unstored = result[:3]
             return result
-        self.unstored = None
         if before is not None:
             before.put_back()
         env_index, what = reason

@@ -83,15 +83,7 @@ class Stack:
         :raises SnapshotUnsupportedError: if a layer holds something that cannot be captured.
         """
         freezer = Freezer(kind_of, self._refs, len(self._stateful))
-        # A Monitor that is left out keeps its place, which nodes refer to.
-        frozen = tuple(
-            [
-                self._freeze_layer(freezer, layer)
-                if monitor or not layer.monitor
-                else FrozenLayer(layer.name, True, None, None)
-                for layer in self._stateful
-            ]
-        )
+        frozen = tuple([self._freeze_layer(freezer, layer, monitor) for layer in self._stateful])
         self._watch(freezer.adapted)
         return frozen, tuple(freezer.nodes)
 
@@ -121,7 +113,9 @@ class Stack:
             if watch is not None:
                 self.watches.append(watch)
 
-    def _freeze_layer(self, freezer: Freezer, layer: Layer) -> FrozenLayer:
+    def _freeze_layer(self, freezer: Freezer, layer: Layer, monitor: bool) -> FrozenLayer:
+        if layer.monitor and not monitor:  # it keeps its place, which nodes refer to
+            return FrozenLayer(layer.name, True, None, None)
         adapter = self._adapters.get(id(layer.env))
         adapted = None if adapter is None else (adapter.capture(layer.env),)
         attributes = None
@@ -135,9 +129,9 @@ class Stack:
         :param frozen: captured layers.
         :raises SnapshotMismatchError: names the difference.
         """
-        monitors = [layer for layer in frozen if layer.monitor]
-        captured = [layer for layer in monitors if layer.attributes is not None]
-        if captured == monitors and self._names == [layer.name for layer in frozen]:
+        captured_monitors = sum(layer.monitor and layer.attributes is not None for layer in frozen)
+        lacks_monitor = len(self.monitors) > captured_monitors
+        if not lacks_monitor and self._names == [layer.name for layer in frozen]:
             return
         ours = [layer.name for layer in self._stateful if not layer.monitor]
         theirs = [layer.name for layer in frozen if not layer.monitor]
@@ -150,7 +144,7 @@ class Stack:
                 "The wrappers differ, outermost first: "
                 f"{_short(theirs)} in the snapshot, {_short(ours)} around this environment."
             )
-        if len(self._stateful) - len(ours) > len(captured):
+        if lacks_monitor:
             raise SnapshotMismatchError(
                 "This environment has a Monitor, and the snapshot is of one without: the episode in progress "
                 "that the Monitor should continue is not in it. Restore it into a clone() instead."

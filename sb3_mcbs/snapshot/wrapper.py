@@ -157,7 +157,7 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
         """
         copy = SnapshotEnvWrapper(self._stack.clone())
         if self._stack.incomplete_clones:
-            copy.restore(self.snapshot())
+            copy.restore(self.snapshot(monitor=False))
         copy.last_observation = private_copy(self.last_observation)
         return copy
 
