@@ -11,13 +11,14 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_mcbs.models.base import Observations
-from sb3_mcbs.models.probing import Randomness, isolated_globals, probe_randomness
+from sb3_mcbs.models.probing import Randomness, probe_randomness
 from sb3_mcbs.snapshot import (
     SIMULATION_DIVERGED,
     Snapshot,
     SnapshotEnvWrapper,
     SnapshotMismatchError,
 )
+from sb3_mcbs.snapshot.global_generators import isolated_globals
 
 
 def stack(observations: list[Any]) -> Observations:

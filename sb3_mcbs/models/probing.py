@@ -1,17 +1,15 @@
 """Random numbers in a look-ahead: whether there are any, and keeping global ones out of it."""
 
-import random
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 
-from sb3_mcbs.models.recognition import random_action
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 from sb3_mcbs.snapshot.generators import get_state, is_generator
+from sb3_mcbs.snapshot.global_generators import global_states, isolated_globals
+from sb3_mcbs.snapshot.spaces import random_action
 
 _STARTS, _STEPS = 3, 12
 
@@ -27,41 +25,13 @@ class Randomness(NamedTuple):
     shared: bool
 
 
-def _global_states() -> tuple[Any, ...]:
-    torch: Any = sys.modules.get("torch")
-    torch_state = None if torch is None else torch.get_rng_state()
-    return random.getstate(), np.random.get_state(), torch_state
-
-
-@contextmanager
-def isolated_globals(seed: int) -> Iterator[None]:
-    """Give ``random``, ``np.random`` and torch other states inside, and their own ones back after.
-
-    An environment that draws from them neither changes nor foresees what the training draws.
-
-    :param seed: for the states inside, in [0, 2**32).
-    """
-    python_state, numpy_state, torch_state = _global_states()
-    try:
-        random.seed(seed)
-        np.random.seed(seed)
-        if torch_state is not None:
-            sys.modules["torch"].default_generator.manual_seed(seed)
-        yield
-    finally:
-        random.setstate(python_state)
-        np.random.set_state(numpy_state)
-        if torch_state is not None:
-            sys.modules["torch"].set_rng_state(torch_state)
-
-
 def _comparable(state: Any) -> str:
     with np.printoptions(threshold=sys.maxsize):
         return repr(state)
 
 
 def _shared_generators() -> list[str]:
-    python_state, numpy_state, torch_state = _global_states()
+    python_state, numpy_state, torch_state = global_states()
     torch_numbers = None if torch_state is None else torch_state.tolist()
     return [_comparable(state) for state in (python_state, numpy_state, torch_numbers)]
 

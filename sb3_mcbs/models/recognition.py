@@ -3,7 +3,6 @@
 These functions run where the environment lives, and only ever step a copy of it.
 """
 
-import inspect
 import pickle
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -16,6 +15,8 @@ from sb3_mcbs.models.base import ForwardModelError
 from sb3_mcbs.models.engines import INTEGRATION
 from sb3_mcbs.models.families import Constants, Fields, family_of, known_families
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
+from sb3_mcbs.snapshot.layers import replaced_method
+from sb3_mcbs.snapshot.spaces import random_action
 
 #: Wrappers that change neither observation nor reward nor action, by their full names: RL Zoo
 #: exchanges Gymnasium's TimeLimit for its own when it is imported, before or after ours.
@@ -81,14 +82,6 @@ def full_name(kind: type) -> str:
     return f"{kind.__module__}.{kind.__qualname__}"
 
 
-def _replaced_method(layer: gym.Env) -> str | None:
-    """The name of a method that was replaced on this instance, if one was."""
-    for name in vars(layer):
-        if inspect.isroutine(inspect.getattr_static(type(layer), name, None)):
-            return name
-    return None
-
-
 def recognize(wrapper: SnapshotEnvWrapper) -> KnownEnvironment | Refusal:
     """Look at an environment and its wrappers.
 
@@ -99,7 +92,7 @@ def recognize(wrapper: SnapshotEnvWrapper) -> KnownEnvironment | Refusal:
     base_class = type(wrapper.unwrapped)
     notable = issubclass(base_class, known_families())
     while True:
-        replaced = _replaced_method(layer)
+        replaced = replaced_method(layer)
         if replaced is not None:
             return Refusal(f"{type(layer).__name__}.{replaced} was replaced on the instance", notable)
         if not isinstance(layer, gym.Wrapper):
@@ -149,14 +142,6 @@ def fields_of(known: KnownEnvironment) -> Fields:
     family = family_of(known.env_class)
     assert family is not None
     return family.fields(known.constants)
-
-
-def random_action(space: Any, rng: np.random.Generator) -> np.ndarray:
-    """A uniform action, or one in [-1, 1] where the space has no bounds."""
-    low = np.where(np.isfinite(space.low), space.low, -1.0)
-    high = np.where(np.isfinite(space.high), space.high, 1.0)
-    action: np.ndarray = rng.uniform(low, high).astype(space.dtype)
-    return action
 
 
 def sample_transitions(wrapper: SnapshotEnvWrapper, state_size: int, lagging: Sequence[str]) -> Sample:

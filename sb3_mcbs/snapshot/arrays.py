@@ -1,15 +1,18 @@
 """NumPy arrays: owned, views of each other, and views into a simulator's memory."""
 
+import array
+import ctypes
 from typing import Any, Literal
 
 import numpy as np
 
 from sb3_mcbs.snapshot.errors import SnapshotMismatchError, SnapshotUnsupportedError
 from sb3_mcbs.snapshot.graph import Copier, Freezer, Thawer
+from sb3_mcbs.snapshot.tensors import bytes_of, is_tensor
 
 
 class ArrayKind:
-    """NumPy arrays. A view stays a view of the same array, or of the same ``bytearray``."""
+    """NumPy arrays. A view stays a view of the same array, or of the same object of plain memory."""
 
     name = "array"
 
@@ -33,10 +36,10 @@ class ArrayKind:
             return _view_of(thawer.thaw(payload[1]), payload[2])
         if form == "objects":
             _, shape, dtype, order, items = payload
-            array = thawer.memo[index] = np.empty(shape, dtype, order)
+            made = thawer.memo[index] = np.empty(shape, dtype, order)
             for place, item in zip(np.ndindex(shape), items, strict=True):
-                array[place] = thawer.thaw(item)
-            return array
+                made[place] = thawer.thaw(item)
+            return made
         content = payload[1]
         if not isinstance(current, np.ndarray) or current.shape != content.shape or not _is_borrowed(current):
             raise SnapshotMismatchError(
@@ -52,17 +55,27 @@ class ArrayKind:
         if layout is not None:
             return _view_of(copier.copy(base), layout)
         if obj.dtype.hasobject:
-            array = copier.enter(obj, np.empty(obj.shape, obj.dtype, _order(obj)))
+            made = copier.enter(obj, np.empty(obj.shape, obj.dtype, _order(obj)))
             for place, item in zip(np.ndindex(obj.shape), obj.ravel().tolist(), strict=True):
-                array[place] = copier.copy(item)
-            return array
+                made[place] = copier.copy(item)
+            return made
         if _is_borrowed(obj):
-            for adapter, old, new in copier.adapted:
-                view = adapter.clone_view(old, new, obj)
-                if view is not None:
-                    return view
-            raise SnapshotUnsupportedError("it is a view into memory that belongs to nothing that is copied")
+            return counterpart(copier, obj)
         return _with_flag(obj.copy(order="K"), obj.flags.writeable)
+
+
+def counterpart(copier: Copier, view: Any) -> Any:
+    """Find in the copied simulators what corresponds to a view into one of the originals.
+
+    :param copier: has copied them.
+    :param view: an array, or another object that a simulator hands out.
+    :raises SnapshotUnsupportedError: if it belongs to none of them.
+    """
+    for adapter, old, new in copier.adapted:
+        found = adapter.clone_view(old, new, view)
+        if found is not None:
+            return found
+    raise SnapshotUnsupportedError("it is a view into memory that belongs to nothing that is copied")
 
 
 class BytearrayKind:
@@ -80,33 +93,52 @@ class BytearrayKind:
         return bytearray(obj)
 
 
-def _owner(array: np.ndarray) -> Any:
+def _owner(view: np.ndarray) -> Any:
     """Return what an array's memory belongs to, if that is not an array."""
-    base: Any = array.base
+    base: Any = view.base
     while isinstance(base, np.ndarray):
         base = base.base
-    return base.obj if isinstance(base, memoryview) else base
+    base = base.obj if isinstance(base, memoryview) else base
+    while getattr(base, "_b_base_", None) is not None:  # a part of a ctypes object
+        base = base._b_base_
+    return base
 
 
-def _is_borrowed(array: np.ndarray) -> bool:
+def _is_plain_memory(owner: Any) -> bool:
+    """Return whether an object is bytes that can be changed, and nothing but them."""
+    if is_tensor(owner):
+        return True
+    if isinstance(owner, ctypes.Array | ctypes.Structure | ctypes.Union):
+        return bool(owner._b_needsfree_)  # others lie in the memory of something else
+    return isinstance(owner, bytearray | array.array)
+
+
+def _is_borrowed(view: np.ndarray) -> bool:
     """Return whether the memory belongs to a simulator, a file or another process."""
-    owner = _owner(array)
-    return owner is not None and not isinstance(owner, bytes | bytearray)
+    owner = _owner(view)
+    return owner is not None and not isinstance(owner, bytes) and not _is_plain_memory(owner)
 
 
-def _order(array: np.ndarray) -> Literal["C", "F"]:
-    return "F" if array.flags.f_contiguous and not array.flags.c_contiguous else "C"
+def _order(values: np.ndarray) -> Literal["C", "F"]:
+    return "F" if values.flags.f_contiguous and not values.flags.c_contiguous else "C"
 
 
-def _base_and_layout(array: np.ndarray) -> tuple[Any, tuple[Any, ...] | None]:
+def _base_and_layout(view: np.ndarray) -> tuple[Any, tuple[Any, ...] | None]:
     """Return what an array is a view of and where; no layout if it is captured by itself."""
-    base = array.base
+    base = view.base
     if type(base) is np.ndarray:
-        return base, None if _is_borrowed(base) else _layout_in(array, base)
-    owner = _owner(array)
-    if type(owner) is not bytearray or not owner or isinstance(base, np.ndarray):
+        return base, None if _is_borrowed(base) else _layout_in(view, base)
+    owner = _owner(view)
+    if isinstance(base, np.ndarray) or not _is_plain_memory(owner) or not _memory(owner).nbytes:
         return None, None
-    return owner, _layout_in(array, np.frombuffer(owner, np.uint8))
+    return owner, _layout_in(view, _memory(owner))
+
+
+def _memory(owner: Any) -> np.ndarray:
+    """Return the bytes of an object of plain memory."""
+    if is_tensor(owner):
+        return bytes_of(owner)
+    return np.frombuffer(owner, np.uint8) if memoryview(owner).nbytes else np.empty(0, np.uint8)
 
 
 def _layout_in(view: np.ndarray, base: np.ndarray) -> tuple[Any, ...] | None:
@@ -121,7 +153,7 @@ def _layout_in(view: np.ndarray, base: np.ndarray) -> tuple[Any, ...] | None:
 
 def _view_of(base: Any, layout: tuple[Any, ...]) -> np.ndarray:
     offset, shape, dtype, strides, writeable = layout
-    memory = base
+    memory = bytes_of(base) if is_tensor(base) else base
     if isinstance(base, np.ndarray):
         memory = base.ravel(order="K")
         # Objects cannot be looked at as bytes.
@@ -129,7 +161,7 @@ def _view_of(base: Any, layout: tuple[Any, ...]) -> np.ndarray:
     return _with_flag(np.ndarray(shape, dtype, memory, offset, strides), writeable)
 
 
-def _with_flag(array: np.ndarray, writeable: bool) -> np.ndarray:
+def _with_flag(values: np.ndarray, writeable: bool) -> np.ndarray:
     if not writeable:
-        array.setflags(write=False)
-    return array
+        values.setflags(write=False)
+    return values

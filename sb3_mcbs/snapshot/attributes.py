@@ -57,7 +57,11 @@ def thaw_attributes(
     values = dict(attributes)
     for name, value in attributes.items():
         if type(value) is Ref and name != "_np_random":
-            values[name] = thawer.thaw(value, have.get(name, MISSING))
+            try:
+                values[name] = thawer.thaw(value, have.get(name, MISSING))
+            except SnapshotUnsupportedError as error:
+                error.path.insert(0, f"{type(env).__name__}.{name}")
+                raise
             if values[name] is MISSING:
                 del values[name]
     # Gymnasium keeps it on the class until it is first needed.

@@ -15,9 +15,12 @@ _WRAPPED = "__wrapped__"
 
 
 @functools.lru_cache(maxsize=1024)
-def _fingerprint(code: types.CodeType) -> tuple[Any, ...]:
-    """Say what a function does, in a form that can be pickled."""
-    constants = tuple(_fingerprint(c) if isinstance(c, types.CodeType) else repr(c) for c in code.co_consts)
+def fingerprint(code: types.CodeType) -> tuple[Any, ...]:
+    """Say what a function does, in a form that can be pickled.
+
+    :param code: of the function.
+    """
+    constants = tuple(fingerprint(c) if isinstance(c, types.CodeType) else repr(c) for c in code.co_consts)
     return code.co_name, code.co_firstlineno, code.co_code, code.co_names, constants
 
 
@@ -34,7 +37,7 @@ class FunctionName:
         code = function.__code__
         self.module = function.__module__
         self.qualname = function.__qualname__
-        self.code = _fingerprint(code)
+        self.code = fingerprint(code)
         self.function: types.FunctionType | None = function
 
     def __getstate__(self) -> dict[str, Any]:
@@ -48,7 +51,7 @@ class FunctionName:
         if not isinstance(other, types.FunctionType):
             return False
         return (other.__module__, other.__qualname__) == (self.module, self.qualname) and (
-            _fingerprint(other.__code__) == self.code
+            fingerprint(other.__code__) == self.code
         )
 
     def find(self) -> types.FunctionType:

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
+from sb3_mcbs.snapshot.errors import SnapshotError, SnapshotUnsupportedError
 
 #: Stands for "there is nothing at this place".
 MISSING: Any = type("Missing", (), {"__repr__": lambda self: "MISSING"})()
@@ -80,11 +80,13 @@ class Freezer:
         self.nodes: list[Node] = [("known", None)] * n_known
         #: The objects that adapters captured.
         self.adapted: list[Any] = []
+        #: The tensors that were captured.
+        self.tensors: list[Any] = []
         self._kind_of = kind_of
         self._memo = dict(known)
         self._owners: dict[int, Ref] = {}
-        # An id is only unique among objects that live, and some objects on the way are temporary.
-        self._alive: list[Any] = []
+        #: What was met. An id is only unique among objects that live, and some on the way are temporary.
+        self.alive: list[Any] = []
 
     def freeze(self, value: Any) -> Any:
         """Return a frozen value.
@@ -99,7 +101,7 @@ class Freezer:
             return ref
         ref = self._memo[id(value)] = Ref(len(self.nodes))
         self.nodes.append(("pending", None))
-        self._alive.append(value)
+        self.alive.append(value)
         self.nodes[ref.index] = (kind.name, kind.freeze(self, value))
         return ref
 
@@ -112,6 +114,7 @@ class Freezer:
         owner = self._owners.get(id(part))
         if owner is None:
             self._owners[id(part)] = self._memo[id(obj)]
+            self.alive.append(part)
         return owner
 
     def freeze_or_none(self, *values: Any) -> tuple[Any, ...] | None:
@@ -119,16 +122,18 @@ class Freezer:
 
         :param values: any values that an environment holds.
         """
-        n_nodes, n_alive, n_adapted = len(self.nodes), len(self._alive), len(self.adapted)
+        n_nodes, n_alive = len(self.nodes), len(self.alive)
+        n_adapted, n_tensors = len(self.adapted), len(self.tensors)
         try:
             return tuple([self.freeze(value) for value in values])
         except SnapshotUnsupportedError:
-            for obj in self._alive[n_alive:]:
+            for obj in self.alive[n_alive:]:
                 self._memo.pop(id(obj), None)
             self._owners = {part: ref for part, ref in self._owners.items() if ref.index < n_nodes}
             del self.nodes[n_nodes:]
-            del self._alive[n_alive:]
+            del self.alive[n_alive:]
             del self.adapted[n_adapted:]
+            del self.tensors[n_tensors:]
             return None
 
 
@@ -165,7 +170,12 @@ class Thawer:
         if index in self.memo:
             return self.memo[index]
         name, payload = self.nodes[index]
-        thawed = self.memo[index] = self._kinds[name].thaw(self, index, payload, current)
+        try:
+            thawed = self.memo[index] = self._kinds[name].thaw(self, index, payload, current)
+        except SnapshotError:
+            raise
+        except Exception as error:
+            raise _cannot_be_made(name if current is MISSING else class_name(type(current)), error) from error
         return thawed
 
     def claim(self, obj: Any) -> bool:
@@ -211,7 +221,7 @@ class Copier:
         self.memo = known
         self.adapted: list[tuple[Any, Any, Any]] = []
         self.kind_of = kind_of
-        self._alive: list[Any] = []
+        self.alive: list[Any] = []
 
     def copy(self, value: Any) -> Any:
         """Return the copy of a value.
@@ -223,9 +233,14 @@ class Copier:
             return value
         key = id(value)
         if key not in self.memo:
-            self._alive.append(value)
-            # The kind enters it in the memo as well if the object can refer to itself.
-            self.memo[key] = kind.copy(self, value)
+            self.alive.append(value)
+            try:
+                # The kind enters it in the memo as well if the object can refer to itself.
+                self.memo[key] = kind.copy(self, value)
+            except SnapshotError:
+                raise
+            except Exception as error:
+                raise _cannot_be_made(class_name(type(value)), error) from error
         return self.memo[key]
 
     def enter(self, value: Any, copy: Any) -> Any:
@@ -235,9 +250,15 @@ class Copier:
         :param copy: its copy, still empty.
         :return: ``copy``.
         """
-        self._alive.append(value)
+        self.alive.append(value)
         self.memo[id(value)] = copy
         return copy
+
+
+def _cannot_be_made(what: str, error: Exception) -> SnapshotUnsupportedError:
+    return SnapshotUnsupportedError(
+        f"making another {what} of the same content raised {type(error).__name__}: {error}"
+    )
 
 
 def private_copy(obj: Any) -> Any:

@@ -13,7 +13,8 @@ from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec, WrapperSpec
 
 from sb3_mcbs.snapshot import generators
-from sb3_mcbs.snapshot.arrays import ArrayKind, BytearrayKind
+from sb3_mcbs.snapshot.arrays import ArrayKind, BytearrayKind, counterpart
+from sb3_mcbs.snapshot.classes import ClassKind, is_made_per_instance
 from sb3_mcbs.snapshot.containers import DictKind, SequenceKind
 from sb3_mcbs.snapshot.errors import SnapshotMismatchError
 from sb3_mcbs.snapshot.functions import BuiltinMethodKind, CellKind, FunctionKind, MethodKind
@@ -21,6 +22,7 @@ from sb3_mcbs.snapshot.graph import ATOMIC_CLASSES, MISSING, Copier, Freezer, Ki
 from sb3_mcbs.snapshot.objects import ObjectKind, ReducedKind, is_global, is_ordinary
 from sb3_mcbs.snapshot.randomness import GeneratorKind, SeedsKind, SpaceKind
 from sb3_mcbs.snapshot.registry import SnapshotAdapter, call_on_change, find_adapter
+from sb3_mcbs.snapshot.tensors import TensorKind, is_tensor
 
 #: Parts of packages that draw: what they hold is not state of the environment.
 _DRAWING = (
@@ -34,7 +36,10 @@ _DRAWING = (
     "gymnasium.envs.classic_control.rendering",
 )
 
-_ATOMIC_BASES = (type, np.generic, np.dtype, enum.Enum, pathlib.PurePath)
+_SIMULATOR_PARTS = "mujoco._structs."
+_MUJOCO_DRAWING = ("mujoco._structs.Mjv", "mujoco._structs.Mjr")
+
+_ATOMIC_BASES = (np.generic, np.dtype, enum.Enum, pathlib.PurePath)
 _EXACT: dict[type, str] = {
     np.ndarray: "array",
     list: "sequence",
@@ -75,6 +80,15 @@ class WindowKind(ConstantKind):
 
     def copy(self, copier: Copier, obj: Any) -> Any:
         return None
+
+
+class PartKind(ConstantKind):
+    """Parts of a simulator that it hands out, as ``data.body("torso")``: its state is theirs."""
+
+    name = "part"
+
+    def copy(self, copier: Copier, obj: Any) -> Any:
+        return counterpart(copier, obj)
 
 
 class AdapterKind:
@@ -129,15 +143,18 @@ def plan_adapter(thawer: Thawer, adapter: SnapshotAdapter | None, obj: Any, stat
 #: Kinds by name, as nodes name them.
 KINDS: dict[str, Kind] = {}
 for _kind_class in (
-    ConstantKind, WindowKind, ArrayKind, BytearrayKind, SequenceKind, DictKind, GeneratorKind, SeedsKind,
-    SpaceKind, ObjectKind, ReducedKind, AdapterKind, FunctionKind, CellKind, MethodKind, BuiltinMethodKind,
+    ConstantKind, WindowKind, PartKind, ArrayKind, BytearrayKind, TensorKind, SequenceKind, DictKind,
+    GeneratorKind, SeedsKind, SpaceKind, ObjectKind, ReducedKind, AdapterKind,
+    ClassKind, FunctionKind, CellKind, MethodKind, BuiltinMethodKind,
 ):  # fmt: skip
     KINDS[_kind_class.name] = _kind_class()
 
 _kind_by_class: dict[type, Kind | None] = dict.fromkeys(ATOMIC_CLASSES)
+_kind_of_class: dict[type, Kind | None] = {}
 
 
 def _forget() -> None:
+    _kind_of_class.clear()
     _kind_by_class.clear()
     _kind_by_class.update(dict.fromkeys(ATOMIC_CLASSES))
 
@@ -154,7 +171,18 @@ def kind_of(obj: Any) -> Kind | None:
     try:
         return _kind_by_class[cls]
     except KeyError:
+        if isinstance(obj, type):
+            return _kind_of(obj)
         kind = _kind_by_class[cls] = _decide(obj, cls)
+        return kind
+
+
+def _kind_of(cls: type) -> Kind | None:
+    """Return the kind of a class itself."""
+    try:
+        return _kind_of_class[cls]
+    except KeyError:
+        kind = _kind_of_class[cls] = KINDS["class"] if is_made_per_instance(cls, kind_of) else None
         return kind
 
 
@@ -170,8 +198,12 @@ def _decide(obj: Any, cls: type) -> Kind | None:
         return KINDS["constant"]
     # A pointer class is made once, by whoever needs it first; what it points to says whose it is.
     name = class_name(cls._type_ if issubclass(cls, ctypes._Pointer) else cls)
+    if name.startswith(_SIMULATOR_PARTS):
+        return KINDS["constant" if name.startswith(_MUJOCO_DRAWING) else "part"]
     if any(name.startswith(part + ".") for part in _DRAWING):
         return KINDS["window"]
+    if is_tensor(obj):
+        return KINDS["torch"]
     if generators.is_generator(obj):
         return KINDS["generator"]
     if issubclass(cls, spaces.Space):

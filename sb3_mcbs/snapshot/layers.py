@@ -1,5 +1,6 @@
 """The layers of an environment: its wrappers, outermost first, and the environment itself."""
 
+import inspect
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -7,10 +8,9 @@ from gymnasium import spaces
 
 from sb3_mcbs.snapshot.graph import class_name
 
-#: Attributes of a layer that say how it was made or how it is drawn, or that are the layer below.
+#: Attributes of a layer that say how it was made or how it is drawn.
 NOT_STATE = frozenset(
     {
-        "env",
         "spec",
         "_cached_spec",
         "metadata",
@@ -22,9 +22,12 @@ NOT_STATE = frozenset(
     }
 )
 
+# A wrapper's ``env`` is the layer below. An environment may hold its simulator under this name.
+_WRAPPER_NOT_STATE = NOT_STATE | {"env"}
+
 _MONITOR = "stable_baselines3.common.monitor.Monitor"
 # Monitor's file and the time since it was made belong to one instance.
-_MONITOR_NOT_STATE = NOT_STATE | {"results_writer", "t_start"}
+_MONITOR_NOT_STATE = _WRAPPER_NOT_STATE | {"results_writer", "t_start"}
 
 _RECORDERS = frozenset(
     {
@@ -61,14 +64,15 @@ def layers_of(env: Any) -> list[Layer]:
 
     :param env: the environment with its wrappers.
     """
-    layers = []
+    layers: list[Layer] = []
     while True:
         names = [class_name(cls) for cls in type(env).__mro__]
         recorder, monitor = not _RECORDERS.isdisjoint(names), _MONITOR in names
         name = _SAME_CLASS.get(names[0], names[0])
-        layers.append(Layer(env, name, recorder, monitor, _MONITOR_NOT_STATE if monitor else NOT_STATE))
         if not isinstance(env, gym.Wrapper):
-            return layers
+            return [*layers, Layer(env, name, recorder, monitor, NOT_STATE)]
+        not_state = _MONITOR_NOT_STATE if monitor else _WRAPPER_NOT_STATE
+        layers.append(Layer(env, name, recorder, monitor, not_state))
         env = env.env
 
 
@@ -84,3 +88,19 @@ def describe_space(space: Any) -> str:
     shape = getattr(space, "shape", None)
     size = f"({space.n})" if isinstance(space, spaces.Discrete) else f"{shape} {getattr(space, 'dtype', '')}"
     return f"{type(space).__name__}{size}"
+
+
+#: The attribute that an environment has whose ``reset`` and ``step`` are recorded for a replay.
+RECORDER = "_snapshot_recorder"
+
+
+def replaced_method(layer: Any) -> str | None:
+    """Return the name of a method that was replaced on an instance, if one was.
+
+    :param layer: the wrapper or the environment.
+    """
+    ours = {"reset", "step"} if RECORDER in vars(layer) else ()
+    for name in vars(layer):
+        if name not in ours and inspect.isroutine(inspect.getattr_static(type(layer), name, None)):
+            return name
+    return None

@@ -7,6 +7,7 @@ model, which environments may edit.
 
 import ctypes
 import operator
+import re
 import weakref
 from collections import OrderedDict
 from collections.abc import Callable
@@ -25,6 +26,9 @@ _MAX_SPARES = 128
 # Sizes that tell a reader most about how two models differ come first in a message.
 _TELLING = ("nq", "nv", "nu", "nbody", "njnt", "ngeom")
 _MAX_SPARE_MODELS = 16
+
+# What a model or its data hand out as objects of their own.
+_PARTS = ("opt", "stat", "vis", "contact", "warning", "timer", "solver")
 
 _BAD_NUMBERS = [
     int(mujoco.mjtWarning.mjWARN_BADQPOS),
@@ -209,8 +213,8 @@ class MjModelAdapter(SnapshotAdapter):
     def clone(self, obj: Any, copy: Callable[[Any], Any]) -> Any:
         return obj.__copy__()
 
-    def clone_view(self, obj: Any, new: Any, array: np.ndarray) -> np.ndarray | None:
-        return _counterpart(obj, new, array)
+    def clone_view(self, obj: Any, new: Any, view: Any) -> Any:
+        return _counterpart(obj, new, view)
 
 
 # Making an MjData takes 100 times as long as copying into one, so those of dropped snapshots are used again.
@@ -334,17 +338,41 @@ class MjDataAdapter(SnapshotAdapter):
 
         return diverged
 
-    def clone_view(self, obj: Any, new: Any, array: np.ndarray) -> np.ndarray | None:
-        return _counterpart(obj, new, array)
+    def clone_view(self, obj: Any, new: Any, view: Any) -> Any:
+        return _counterpart(obj, new, view)
 
 
-def _counterpart(obj: Any, new: Any, array: np.ndarray) -> np.ndarray | None:
-    """Find the view into ``new`` that lies where ``array`` lies in ``obj``."""
+def _counterpart(obj: Any, new: Any, view: Any) -> Any:
+    """Find in ``new`` what ``view`` is in ``obj``: an array, ``model.opt``, ``data.body("torso")``."""
+    if not isinstance(view, np.ndarray):
+        return _counterpart_of_part(obj, new, view)
     for name in _public(type(obj)):
         field = getattr(obj, name)
-        if not isinstance(field, np.ndarray) or not np.may_share_memory(field, array):
+        if not isinstance(field, np.ndarray) or not np.may_share_memory(field, view):
             continue
         memory = getattr(new, name).reshape(-1).view(np.uint8)
-        offset = _address(array) - _address(field)
-        return np.ndarray(array.shape, array.dtype, memory, offset, array.strides)
+        offset = _address(view) - _address(field)
+        return np.ndarray(view.shape, view.dtype, memory, offset, view.strides)
+    for part in _array_parts(obj):
+        array = operator.attrgetter(part)(obj)
+        if np.may_share_memory(array, view):
+            memory = operator.attrgetter(part)(new).reshape(-1).view(np.uint8)
+            return np.ndarray(view.shape, view.dtype, memory, _address(view) - _address(array), view.strides)
+    return None
+
+
+def _array_parts(obj: Any) -> list[str]:
+    """Name the arrays of a model's options and statistics."""
+    return _layout(obj).vectors if is_model(obj) else []
+
+
+def _counterpart_of_part(obj: Any, new: Any, part: Any) -> Any:
+    accessor = re.fullmatch(r"_Mj(Data|Model)(\w+)Views", type(part).__name__)
+    if accessor is not None:
+        name = accessor[2].lower()
+        found = getattr(obj, name, None)
+        return getattr(new, name)(part.id) if found is not None and found(part.id) is part else None
+    for name in _PARTS:
+        if getattr(obj, name, None) is part:
+            return getattr(new, name)
     return None

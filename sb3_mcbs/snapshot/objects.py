@@ -23,10 +23,11 @@ class ObjectKind:
             except SnapshotUnsupportedError as error:
                 error.path.insert(0, f".{name}")
                 raise
-        return type(obj), tuple(attributes)
+        return freezer.freeze(type(obj)), tuple(attributes)
 
     def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
         cls, attributes = payload
+        cls = thawer.thaw(cls, MISSING if current is MISSING else type(current))
         have = attributes_of(current) if type(current) is cls else {}
         if _is_value(cls) or type(current) is not cls or not thawer.claim(current):
             return _made_anew(thawer, index, cls, attributes, have)
@@ -40,7 +41,7 @@ class ObjectKind:
         return current
 
     def copy(self, copier: Copier, obj: Any) -> Any:
-        made = copier.enter(obj, object.__new__(type(obj)))
+        made = copier.enter(obj, blank(copier.copy(type(obj))))
         attributes, put = attributes_of(obj), _setter(made)
         copies = {}
         for name in sorted(attributes, key=lambda name: not _is_hashed(copier, attributes[name])):
@@ -48,6 +49,18 @@ class ObjectKind:
             put(name, copies[name])
         _set_in_order(made, {name: copies[name] for name in attributes})
         return made
+
+
+def blank(cls: type) -> Any:
+    """Make an object without calling its constructor.
+
+    :param cls: its class.
+    """
+    try:
+        return object.__new__(cls)
+    except TypeError:  # some compiled classes, such as SimpleNamespace, want their own
+        made: Any = cls
+        return made.__new__(cls)
 
 
 def _is_value(cls: type) -> bool:
@@ -64,7 +77,7 @@ def _made_anew(thawer: Thawer, index: int, cls: type, attributes: Any, have: dic
 
     Those that a hash is computed from come first: on the way to the others may be a set that it is in.
     """
-    made: Any = object.__new__(cls)
+    made: Any = blank(cls)
     thawer.memo[index] = made
     put = _setter(made)
     values = {}

@@ -6,8 +6,8 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_mcbs.snapshot import generators
-from sb3_mcbs.snapshot.errors import SnapshotMismatchError
 from sb3_mcbs.snapshot.graph import MISSING, Copier, Freezer, Ref, Thawer
+from sb3_mcbs.snapshot.spaces import definition_of, is_defined_as, made_of, parts_of
 
 
 class GeneratorKind:
@@ -124,22 +124,23 @@ def _reseed_sequence(
 
 
 class SpaceKind:
-    """Spaces do not change; the generators that they sample with do."""
+    """Spaces: what they contain is state, as environments may exchange them, and so are their generators.
+
+    A space that is still the same stays where it is: others hold it, too.
+    """
 
     name = "space"
 
     def freeze(self, freezer: Freezer, obj: spaces.Space) -> Any:
-        return tuple(freezer.freeze(part._np_random) for part in _parts(obj))
+        parts = parts_of(obj)
+        return definition_of(obj), tuple(freezer.freeze(part._np_random) for part in parts)
 
     def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
-        if not isinstance(current, spaces.Space):
-            raise SnapshotMismatchError("The snapshot holds a space where this environment has none.")
-        parts = _parts(current)
-        if len(parts) != len(payload):
-            raise SnapshotMismatchError(
-                f"A space of the snapshot has {len(payload)} parts, here it has {len(parts)} ({current})."
-            )
-        for part, value in zip(parts, payload, strict=True):
+        definition, generators_of_parts = payload
+        if not isinstance(current, spaces.Space) or not is_defined_as(current, definition):
+            current = made_of(definition)
+        parts = parts_of(current)
+        for part, value in zip(parts, generators_of_parts, strict=True):
             thaw_np_random(thawer, value, vars(part))
         return current
 
@@ -147,25 +148,6 @@ class SpaceKind:
         made = copier.enter(obj, object.__new__(type(obj)))
         vars(made).update({name: copier.copy(value) for name, value in vars(obj).items()})
         return made
-
-
-def _parts(space: spaces.Space) -> list[spaces.Space]:
-    """Return a space and the spaces in it."""
-    if isinstance(space, spaces.Box | spaces.Discrete | spaces.MultiBinary):
-        return [space]
-    parts = [space]
-    for value in vars(space).values():
-        inner = (
-            value.values()
-            if isinstance(value, dict)
-            else value
-            if isinstance(value, list | tuple)
-            else [value]
-        )
-        for item in inner:
-            if isinstance(item, spaces.Space):
-                parts.extend(_parts(item))
-    return parts
 
 
 def thaw_np_random(thawer: Thawer, value: Any, attributes: dict[str, Any]) -> None:

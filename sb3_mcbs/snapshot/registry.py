@@ -84,13 +84,14 @@ class SnapshotAdapter(ABC):
         """
         return None
 
-    def clone_view(self, obj: Any, new: Any, array: Any) -> Any:
-        """Find in a cloned object the array that corresponds to a view into the original.
+    def clone_view(self, obj: Any, new: Any, view: Any) -> Any:
+        """Find in a cloned object what corresponds to a view into the original.
 
         :param obj: the original.
         :param new: its clone.
-        :param array: an array whose memory belongs to something that is not an array.
-        :return: the corresponding view into ``new``, or None if the memory is not the object's.
+        :param view: an array whose memory belongs to something that is not an array, or another object that
+            a simulator hands out.
+        :return: the corresponding view into ``new``, or None if it is not a view into ``obj``.
         """
         return None
 

@@ -14,11 +14,8 @@ from sb3_mcbs.snapshot.attributes import freeze_attributes, thaw_attributes
 from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
 from sb3_mcbs.snapshot.graph import Freezer, Node, Ref, Thawer, private_copy
 from sb3_mcbs.snapshot.kinds import KINDS, kind_of
-from sb3_mcbs.snapshot.layers import NOT_STATE
+from sb3_mcbs.snapshot.layers import NOT_STATE, RECORDER
 from sb3_mcbs.snapshot.registry import SnapshotAdapter
-
-_RECORDER = "_snapshot_recorder"
-_NOT_STATE = NOT_STATE | {"reset", "step", _RECORDER}
 
 
 class Episode(NamedTuple):
@@ -44,11 +41,13 @@ class Recorder:
 
     :param env: the environment.
     :param prepare: called with the environment before each reset.
+    :param not_state: names of attributes that are not put back before a replay.
     """
 
-    def __init__(self, env: Any, prepare: Callable[[Any], None] | None) -> None:
+    def __init__(self, env: Any, prepare: Callable[[Any], None] | None, not_state: frozenset[str]) -> None:
         self.env = env
         self._prepare = prepare
+        self._not_state = NOT_STATE | not_state
         self.episode: Episode | None = None
         self.actions: list[Any] = []
         self._reset = env.reset
@@ -57,7 +56,7 @@ class Recorder:
         self._inside = False
         env.reset = functools.wraps(env.reset)(lambda **arguments: self.reset(**arguments))
         env.step = functools.wraps(env.step)(lambda action: self.step(action))
-        setattr(env, _RECORDER, self)
+        setattr(env, RECORDER, self)
 
     def reset(self, **arguments: Any) -> Any:
         """Reset the environment and begin a record.
@@ -98,7 +97,7 @@ class Recorder:
         :param arguments: of the reset that follows.
         """
         freezer = Freezer(kind_of, {id(self.env): Ref(0)}, 1)
-        attributes = freeze_attributes(freezer, self.env, _NOT_STATE, skip_unsupported=True)
+        attributes = freeze_attributes(freezer, self.env, self._not_state, skip_unsupported=True)
         self.episode = Episode(attributes, tuple(freezer.nodes), private_copy(arguments), ())
         self.actions = []
 
@@ -108,7 +107,7 @@ class Recorder:
         :param episode: what to repeat.
         """
         thawer = Thawer(episode.nodes, KINDS, [self.env], "restore")
-        thaw_attributes(thawer, self.env, _NOT_STATE, episode.attributes, delete_others=False)
+        thaw_attributes(thawer, self.env, self._not_state, episode.attributes, delete_others=False)
         thawer.commit()
         render_mode, self.env.render_mode = self.env.render_mode, None
         try:
@@ -136,16 +135,18 @@ class ReplayAdapter(SnapshotAdapter):
     """
 
     with_attributes = True
-    not_state = frozenset({"reset", "step", _RECORDER})
+    not_state = frozenset({"reset", "step", RECORDER})
 
     def __init__(self, prepare: Callable[[Any], None] | None = None) -> None:
         self._prepare = prepare
         self._told: set[type] = set()
+        # A subclass names its own.
+        self.not_state = ReplayAdapter.not_state | type(self).not_state
 
     def attach(self, env: Any) -> None:
         if _recorder(env) is None:
             _constructor_arguments(env)
-            Recorder(env, self._prepare)
+            Recorder(env, self._prepare, self.not_state)
 
     def capture(self, obj: Any) -> Episode | None:
         recorder = _recorder(obj)
@@ -188,7 +189,7 @@ class ReplayAdapter(SnapshotAdapter):
 
 
 def _recorder(env: Any) -> Recorder | None:
-    return vars(env).get(_RECORDER)
+    return vars(env).get(RECORDER)
 
 
 def _constructor_arguments(env: Any) -> inspect.BoundArguments:

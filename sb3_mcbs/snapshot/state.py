@@ -1,21 +1,22 @@
 """The state of a stack of layers: captured, checked, put back, cloned."""
 
 import contextlib
+import itertools
 import operator
-import random
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import gymnasium as gym
-import numpy as np
 
 from sb3_mcbs.snapshot.attributes import freeze_attributes, thaw_attributes
 from sb3_mcbs.snapshot.errors import SnapshotMismatchError, SnapshotUnsupportedError
+from sb3_mcbs.snapshot.global_generators import globals_kept
 from sb3_mcbs.snapshot.graph import Copier, Freezer, Node, Ref, RngMode, Thawer
 from sb3_mcbs.snapshot.kinds import KINDS, kind_of, plan_adapter
 from sb3_mcbs.snapshot.layers import Layer, layers_of
-from sb3_mcbs.snapshot.objects import attributes_of, set_attributes
+from sb3_mcbs.snapshot.objects import attributes_of, blank, set_attributes
 from sb3_mcbs.snapshot.registry import SnapshotAdapter, find_adapter
+from sb3_mcbs.snapshot.tensors import check_memory
 
 _NEEDS_RENDERING = "gymnasium.wrappers.transform_observation.AddRenderObservation"
 
@@ -28,12 +29,14 @@ class FrozenLayer(NamedTuple):
     :param adapted: what the layer's adapter captured, in a tuple; None if it has no adapter.
     :param attributes: the frozen value of each captured attribute; None if none are captured, as of a
         ``Monitor`` that was left out.
+    :param cls: the layer's frozen class, which has state of its own if it was made for this layer.
     """
 
     name: str
     monitor: bool
     adapted: tuple[Any] | None
     attributes: dict[str, Any] | None
+    cls: Any
 
 
 class Stack:
@@ -44,16 +47,16 @@ class Stack:
     """
 
     def __init__(self, owner: gym.Wrapper[Any, Any, Any, Any]) -> None:
-        self._layers = [_with_adapter(layer) for layer in layers_of(owner.env)]
-        self._stateful = [layer for layer in self._layers if not layer.recorder]
+        self.layers = [_with_adapter(layer) for layer in layers_of(owner.env)]
+        self._stateful = [layer for layer in self.layers if not layer.recorder]
         self._names = [layer.name for layer in self._stateful]
         self._adapters: dict[int, SnapshotAdapter] = {}
         self._owner = owner
-        self.monitors = [layer.env for layer in self._layers if layer.monitor]
+        self.monitors = [layer.env for layer in self.layers if layer.monitor]
         #: Each says whether a simulator gave up its state since it was called last.
         self.watches: list[Callable[[], bool]] = []
         self._watched: list[Any] | None = None
-        for layer in self._layers:
+        for layer in self.layers:
             if layer.name == _NEEDS_RENDERING:
                 raise SnapshotUnsupportedError(
                     f"{layer.name} draws its observations, and copies of an environment cannot draw. "
@@ -66,9 +69,30 @@ class Stack:
         # A recorder is named as the layer below it: where the state is put back there may be none.
         self._refs = {id(owner): Ref(0)}
         place = 0
-        for layer in self._layers:
+        for layer in self.layers:
             self._refs[id(layer.env)] = Ref(place)
             place += not layer.recorder
+
+    @contextlib.contextmanager
+    def bare(self) -> Iterator[gym.Env[Any, Any]]:
+        """Take out monitors and recorders, and draw nothing, while it is entered.
+
+        :return: the outermost of the other layers.
+        """
+        kept = [layer.env for layer in self.layers if not layer.recorder and not layer.monitor]
+        below = [env.env for env in kept[:-1]]
+        draws = vars(kept[-1]).get("render_mode")
+        try:
+            for env, its in itertools.pairwise(kept):
+                env.env = its
+            if draws is not None:
+                kept[-1].render_mode = None
+            yield kept[0]
+        finally:
+            for env, its in zip(kept, below, strict=False):
+                env.env = its
+            if draws is not None:
+                kept[-1].render_mode = draws
 
     @property
     def incomplete_clones(self) -> bool:
@@ -84,6 +108,7 @@ class Stack:
         """
         freezer = Freezer(kind_of, self._refs, len(self._stateful))
         frozen = tuple([self._freeze_layer(freezer, layer, monitor) for layer in self._stateful])
+        check_memory(freezer)
         self._watch(freezer.adapted)
         return frozen, tuple(freezer.nodes)
 
@@ -91,7 +116,7 @@ class Stack:
         """Watch the simulators that are there now: a reset of the environment may exchange its own."""
         if not self.watches:
             return
-        present = {id(value) for layer in self._layers for value in attributes_of(layer.env).values()}
+        present = {id(value) for layer in self.layers for value in attributes_of(layer.env).values()}
         if not all(id(obj) in present for obj in self._watched or ()):
             # Whoever takes a snapshot is told what cannot be captured.
             with contextlib.suppress(SnapshotUnsupportedError):
@@ -107,7 +132,7 @@ class Stack:
             return
         self._watched = held
         self.watches = []
-        for obj in (*held, *(layer.env for layer in self._layers)):
+        for obj in (*held, *(layer.env for layer in self.layers)):
             adapter = find_adapter(obj)
             watch = None if adapter is None else adapter.watch(obj)
             if watch is not None:
@@ -115,13 +140,14 @@ class Stack:
 
     def _freeze_layer(self, freezer: Freezer, layer: Layer, monitor: bool) -> FrozenLayer:
         if layer.monitor and not monitor:  # it keeps its place, which nodes refer to
-            return FrozenLayer(layer.name, True, None, None)
+            return FrozenLayer(layer.name, True, None, None, None)
         adapter = self._adapters.get(id(layer.env))
         adapted = None if adapter is None else (adapter.capture(layer.env),)
         attributes = None
         if adapter is None or adapter.with_attributes:
             attributes = freeze_attributes(freezer, layer.env, layer.not_state, adapter is not None)
-        return FrozenLayer(layer.name, layer.monitor, adapted, attributes)
+        cls = freezer.freeze(type(layer.env)) if adapter is None else None
+        return FrozenLayer(layer.name, layer.monitor, adapted, attributes, cls if type(cls) is Ref else None)
 
     def check(self, frozen: tuple[FrozenLayer, ...]) -> None:
         """Refuse the state of other layers.
@@ -170,6 +196,7 @@ class Stack:
             adapter = self._adapters.get(id(layer.env))
             if captured.adapted is not None:
                 plan_adapter(thawer, adapter, layer.env, captured.adapted[0])
+            thawer.thaw(captured.cls, type(layer.env))
             if captured.attributes is not None:
                 thaw_attributes(thawer, layer.env, layer.not_state, captured.attributes, adapter is None)
         thawer.commit()
@@ -191,26 +218,26 @@ class Stack:
         copier = Copier(kind_of, copies)
         ordinary: list[Layer] = []
         below: Any = None
-        for layer in reversed(self._layers):
+        for layer in reversed(self.layers):
             if not layer.recorder and not layer.monitor:
                 adapter = self._adapters.get(id(layer.env))
                 if adapter is None:
-                    below = object.__new__(type(layer.env))
+                    below = blank(copier.copy(type(layer.env)))
                     ordinary.append(layer)
                 else:
-                    with _global_generators_kept():
+                    with globals_kept():
                         below = adapter.clone(layer.env, copier.copy)
             copies[id(layer.env)] = below
         copies[id(self._owner)] = below
-        # Simulators first: attributes may be views into their memory.
+        # Simulators first, wherever they hang: attributes may be views into their memory.
+        freezer = Freezer(kind_of, self._refs, len(self._stateful))
         for layer in ordinary:
-            for value in attributes_of(layer.env).values():
-                kind = kind_of(value)
-                if kind is not None and kind.name == "adapter":
-                    copier.copy(value)
+            self._freeze_layer(freezer, layer, monitor=False)
+        for simulator in freezer.adapted:
+            copier.copy(simulator)
         for layer in ordinary:
             _copy_attributes(copier, layer)
-        for layer in self._layers[:-1]:
+        for layer in self.layers[:-1]:
             if copies[id(layer.env)] is not copies[id(layer.env.env)]:
                 copies[id(layer.env)].env = copies[id(layer.env.env)]
         return below
@@ -241,14 +268,3 @@ def _copy_attributes(copier: Copier, layer: Layer) -> None:
                 error.path.insert(0, f"{type(layer.env).__name__}.{name}")
                 raise
     set_attributes(copier.memo[id(layer.env)], attributes)
-
-
-@contextlib.contextmanager
-def _global_generators_kept() -> Iterator[None]:
-    """Undo whatever a constructor does to the global generators of Python and NumPy."""
-    python, legacy = random.getstate(), np.random.get_state()
-    try:
-        yield
-    finally:
-        random.setstate(python)
-        np.random.set_state(legacy)

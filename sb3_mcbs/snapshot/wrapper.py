@@ -1,5 +1,6 @@
 """``SnapshotEnvWrapper``: exact snapshots of a whole environment."""
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -7,11 +8,13 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from sb3_mcbs.snapshot.errors import SnapshotMismatchError
+from sb3_mcbs.snapshot.errors import SnapshotError, SnapshotMismatchError, SnapshotUnsupportedError
 from sb3_mcbs.snapshot.faults import diverged_step
 from sb3_mcbs.snapshot.graph import Node, RngMode, private_copy
 from sb3_mcbs.snapshot.layers import describe_space
+from sb3_mcbs.snapshot.replay import Box2DAdapter
 from sb3_mcbs.snapshot.state import FrozenLayer, Stack
+from sb3_mcbs.snapshot.verification import check_exact, has_passed, is_known_exact
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,7 +52,12 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
         env.restore(state)
         again = env.step(action)  # equal to first, bit for bit
 
+    An environment that is not known to be exact is checked when it is first used, usually in its first reset:
+    a few dozen steps from a seeded reset must repeat themselves after a restore and in a clone, bit for bit.
+    This happens once per class and spec in a process, and the environment is then as it was.
+
     :param env: the environment with its wrappers.
+    :param verify: False leaves out that check.
     :raises SnapshotUnsupportedError: if part of it cannot be captured; names the class and the attribute.
     """
 
@@ -57,23 +65,37 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
     last_observation: Any
     #: How often the environment was reset or restored, and the steps since then. Not part of snapshots.
     moment: tuple[int, int]
+    _verified: bool
 
-    def __new__(cls, env: Any = None) -> "SnapshotEnvWrapper":
+    def __new__(cls, env: Any = None, verify: bool = True) -> "SnapshotEnvWrapper":
         if isinstance(env, SnapshotEnvWrapper):
             return env
         return super().__new__(cls)
 
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
+    def __init__(self, env: gym.Env[Any, Any], verify: bool = True) -> None:
+        if not isinstance(verify, bool):
+            raise TypeError(f"verify must be True or False, got {verify!r}")
         if env is self:
+            self._verified = self._verified or not verify
             return
-        gym.utils.RecordConstructorArgs.__init__(self)
+        gym.utils.RecordConstructorArgs.__init__(self, verify=verify)
         gym.Wrapper.__init__(self, env)
         self.last_observation = None
         self.moment = (0, 0)
-        self._spaces = (describe_space(self.observation_space), describe_space(self.action_space))
         self._stack = Stack(self)
+        self._verified = not verify
+        self._spaces = (describe_space(self.observation_space), describe_space(self.action_space))
         # Whatever cannot be captured is better known before training than in the middle of it.
-        self.snapshot()
+        self._stack.freeze()
+        self._own_attributes = frozenset((*vars(self), "_own_attributes"))
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        # ``VecEnv.set_attr`` means the outermost layer. Without this wrapper, that is the one below.
+        own = vars(self).get("_own_attributes")
+        if own is None or name in own or type(self) is not SnapshotEnvWrapper:
+            super().__setattr__(name, value)
+        else:
+            setattr(self.env, name, value)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -83,12 +105,51 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
         :param seed: as in Gymnasium.
         :param options: as in Gymnasium.
         :return: observation and info.
+        :raises SnapshotUnsupportedError: if the environment is checked first and does not pass, see above. It
+            is reset all the same.
         """
+        self.verify(seed, options)
+        return self._reset(seed, options)
+
+    def _reset(self, seed: int | None, options: dict[str, Any] | None) -> tuple[Any, dict[str, Any]]:
         observation, info = self.env.reset(seed=seed, options=options)
         self.last_observation = private_copy(observation)
         self.moment = (self.moment[0] + 1, 0)
         self._stack.find_simulators()
         return observation, info
+
+    def verify(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
+        """Check that snapshots of this environment are exact, if that is not known already.
+
+        The environment is then as it was, in the middle of an episode, too. Neither a ``Monitor`` nor global
+        generators notice.
+
+        :param seed: of the reset that the check begins with; None: 0.
+        :param options: of that reset.
+        :raises SnapshotUnsupportedError: if part of it cannot be captured, or it does not do the same after a
+            restore or in a clone. It is reset then.
+        """
+        if self._verified:
+            return
+        layers = self._stack.layers
+        if not is_known_exact(layers, (Box2DAdapter,)) and not has_passed(layers):
+            try:
+                self._check(seed, options)
+            except SnapshotUnsupportedError:
+                with contextlib.suppress(Exception):  # the error that is raised says more
+                    self._reset(seed, options)
+                raise
+        self._verified = True
+
+    def _check(self, seed: int | None, options: dict[str, Any] | None) -> None:
+        stack = self._stack
+        state = stack.freeze(monitor=False)
+        with stack.bare() as bare:
+            checked = _CheckedEnvironment(stack, bare, 0 if seed is None else seed, options)
+            try:
+                check_exact(checked, stack.layers, self.action_space)
+            finally:
+                checked.put_back(state)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Step the environment.
@@ -118,6 +179,7 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
         :raises SnapshotUnsupportedError: if something that came up since the environment was wrapped
             cannot be captured.
         """
+        self.verify()
         layers, nodes = self._stack.freeze(monitor)
         return Snapshot(layers, nodes, self._spaces, private_copy(self.last_observation))
 
@@ -136,6 +198,7 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
         named = isinstance(rng, str) and rng in ("restore", "keep")
         if not named and not isinstance(rng, np.random.Generator):
             raise ValueError(f'rng must be "restore", "keep" or a numpy.random.Generator, got {rng!r}')
+        self.verify()
         self._stack.check(snapshot.layers)
         for what, ours, its in zip(("observation", "action"), self._spaces, snapshot.spaces, strict=True):
             if ours != its:
@@ -155,9 +218,9 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
 
         :return: the copy, wrapped.
         """
-        copy = SnapshotEnvWrapper(self._stack.clone())
-        if self._stack.incomplete_clones:
-            copy.restore(self.snapshot(monitor=False))
+        self.verify()
+        copy = _clone(self._stack)
+        copy._spaces = self._spaces
         copy.last_observation = private_copy(self.last_observation)
         return copy
 
@@ -170,3 +233,61 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
         :return: what it returns.
         """
         return function(self, *args)
+
+
+def _clone(stack: Stack) -> SnapshotEnvWrapper:
+    copy = SnapshotEnvWrapper(stack.clone(), verify=False)
+    if stack.incomplete_clones:
+        layers, nodes = stack.freeze(monitor=False)
+        copy._stack.thaw(layers, nodes, "restore")
+    return copy
+
+
+class _CheckedEnvironment:
+    """An environment as the check needs it.
+
+    :param stack: its layers.
+    :param env: the outermost one that is stepped.
+    :param seed: of every reset.
+    :param options: of every reset.
+    :param copy: the wrapper around it, if it is a copy.
+    """
+
+    def __init__(
+        self, stack: Stack, env: Any, seed: int, options: Any, copy: SnapshotEnvWrapper | None = None
+    ) -> None:
+        self._stack = stack
+        self._env = env
+        self._reset_arguments = {"seed": seed, "options": options}
+        self._copy = copy
+
+    def capture(self) -> Any:
+        return self._named("capturing its state", lambda: self._stack.freeze(monitor=False))
+
+    def put_back(self, state: Any) -> None:
+        self._named("putting its state back", lambda: self._stack.thaw(state[0], state[1], "restore"))
+
+    def copy(self) -> "_CheckedEnvironment":
+        copy = self._named("making a clone of it", lambda: _clone(self._stack))
+        return _CheckedEnvironment(copy._stack, copy.env, **self._reset_arguments, copy=copy)
+
+    def reset(self) -> None:
+        self._env.reset(**private_copy(self._reset_arguments))
+
+    def step(self, action: Any) -> Any:
+        return self._env.step(action)
+
+    def close(self) -> None:
+        if self._copy is not None:
+            self._copy.close()
+
+    def _named(self, what: str, call: Callable[[], Any]) -> Any:
+        try:
+            return call()
+        except SnapshotError:
+            raise
+        except Exception as error:
+            name = type(self._env.unwrapped).__name__
+            raise SnapshotUnsupportedError(
+                f"{name} cannot be captured: {what} raised {type(error).__name__}: {error}"
+            ) from error

@@ -1,0 +1,211 @@
+"""Classes that are made inside a function, once per instance: what their methods close over is state."""
+
+import contextlib
+import dis
+import enum
+import functools
+import types
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from sb3_mcbs.snapshot.errors import SnapshotMismatchError, SnapshotUnsupportedError
+from sb3_mcbs.snapshot.functions import fingerprint
+from sb3_mcbs.snapshot.graph import MISSING, Copier, Freezer, Thawer, class_name
+
+#: Members that Python makes itself, and those that only say what a class is.
+_NOT_STATE = frozenset(
+    {"__dict__", "__weakref__", "__module__", "__qualname__", "__doc__", "__slots__", "__slotnames__"}
+    | {
+        "__annotations__",
+        "__annotate__",
+        "__abstractmethods__",
+        "_abc_impl",
+        "__parameters__",
+        "__orig_bases__",
+    }
+    | {"__static_attributes__", "__firstlineno__", "__classcell__", "__match_args__", "__dataclass_fields__"}
+    | {"__dataclass_params__", "metadata", "spec", "render_mode"}
+)
+_MADE_BY_PYTHON = (types.MemberDescriptorType, types.GetSetDescriptorType, types.WrapperDescriptorType)
+_SHARED_KINDS = ("constant", "window", "space")
+
+
+class ClassName:
+    """Names a class that no module names. In the process where it was made it also knows the class.
+
+    :param cls: the class.
+    """
+
+    def __init__(self, cls: type) -> None:
+        self.module = cls.__module__
+        self.qualname = cls.__qualname__
+        self.code = _code_of(cls)
+        self.cls: type | None = cls
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "cls": None}
+
+    def is_name_of(self, other: Any) -> bool:
+        """Return whether a class was made by the same lines.
+
+        :param other: any object.
+        """
+        if other is self.cls:
+            return True
+        return (
+            isinstance(other, type)
+            and (other.__module__, other.__qualname__) == (self.module, self.qualname)
+            and _code_of(other) == self.code
+        )
+
+
+def _code_of(cls: type) -> tuple[Any, ...]:
+    return tuple(
+        (name, fingerprint(function.__code__))
+        for name, member in vars(cls).items()
+        for function in _parts(member)
+        if isinstance(function, types.FunctionType)
+    )
+
+
+def _parts(member: Any) -> tuple[Any, ...]:
+    """Return what a member of a class consists of: a property of its functions, others of themselves."""
+    if isinstance(member, property):
+        return member.fget, member.fset, member.fdel
+    if isinstance(member, staticmethod | classmethod):
+        return (member.__func__,)
+    if isinstance(member, functools.cached_property):
+        return (member.func,)
+    return (member,)
+
+
+def _put_together(member: Any, parts: tuple[Any, ...]) -> Any:
+    """Return a member like another one, of other parts."""
+    if all(mine is its for mine, its in zip(parts, _parts(member), strict=True)):
+        return member
+    if isinstance(member, property):
+        return property(parts[0], parts[1], parts[2], member.__doc__)
+    if isinstance(member, staticmethod | classmethod):
+        return type(member)(*parts)
+    if isinstance(member, functools.cached_property):
+        made = functools.cached_property(*parts)
+        made.attrname = member.attrname
+        return made
+    return parts[0]
+
+
+def _members(cls: type) -> Iterator[tuple[str, Any]]:
+    for name, member in vars(cls).items():
+        if name not in _NOT_STATE and not isinstance(member, _MADE_BY_PYTHON):
+            yield name, member
+
+
+def is_made_per_instance(cls: type, kind_of: Callable[[Any], Any]) -> bool:
+    """Return whether a class has state: it was made inside a function, and holds or closes over some.
+
+    :param cls: the class.
+    :param kind_of: the kind of an object; None if it never changes.
+    """
+    bases = [base for base in cls.__mro__ if "<" in base.__qualname__]
+    return bool(bases) and not issubclass(cls, enum.Enum) and any(_has_state(base, kind_of) for base in bases)
+
+
+def _has_state(cls: type, kind_of: Callable[[Any], Any]) -> bool:
+    parts = [part for _, member in _members(cls) for part in _parts(member)]
+    functions = [part for part in parts if isinstance(part, types.FunctionType)]
+    rebound = {name for function in functions for name in _rebound(function.__code__)}
+    return any(_is_state(part, kind_of) for part in parts) or any(
+        _is_state(content, kind_of) or name in rebound
+        for function in functions
+        for name, content in _variables(function)
+        if name != "__class__"
+    )
+
+
+def _is_state(value: Any, kind_of: Callable[[Any], Any]) -> bool:
+    if isinstance(value, type | types.FunctionType):
+        return False  # those with state are met on their own
+    kind = kind_of(value)
+    return kind is not None and kind.name not in _SHARED_KINDS
+
+
+def _variables(function: types.FunctionType) -> Iterator[tuple[str, Any]]:
+    """The variables that a function closes over, and what they hold."""
+    for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
+        with contextlib.suppress(ValueError):  # empty
+            yield name, cell.cell_contents
+
+
+def _rebound(code: types.CodeType) -> Iterator[str]:
+    """The variables that a function declares ``nonlocal`` and assigns to."""
+    for instruction in dis.get_instructions(code):
+        if instruction.opname == "STORE_DEREF" and instruction.argval in code.co_freevars:
+            yield instruction.argval
+    for constant in code.co_consts:
+        if isinstance(constant, types.CodeType):
+            yield from _rebound(constant)
+
+
+class ClassKind:
+    """Classes that are made per instance: their attributes, and what their methods close over, are state."""
+
+    name = "class"
+
+    def freeze(self, freezer: Freezer, obj: type) -> Any:
+        members = []
+        for name, member in _members(obj):
+            try:
+                members.append((name, tuple(freezer.freeze(part) for part in _parts(member))))
+            except SnapshotUnsupportedError as error:
+                error.path.insert(0, f" ({name} of the class {obj.__qualname__})")
+                raise
+        return ClassName(obj), tuple(freezer.freeze(base) for base in obj.__bases__), tuple(members)
+
+    def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
+        name, bases, members = payload
+        if name.is_name_of(current):
+            thawer.memo[index] = current
+            for base, its in zip(bases, current.__bases__, strict=True):
+                thawer.thaw(base, its)
+            for key, parts in members:
+                member = vars(current).get(key)
+                thawed = _put_together(member, _thaw_parts(thawer, parts, _parts(member)))
+                if thawed is not member:
+                    thawer.do_then(type.__setattr__, current, key, thawed)
+            return current
+        template = name.cls
+        if template is None:
+            raise SnapshotMismatchError(
+                f"The snapshot is of an environment that uses the class {name.module}.{name.qualname}, which "
+                "is made inside a function; this one has another at its place."
+            )
+        # What the class at hand closes over may be another instance's.
+        made = thawer.memo[index] = _blank(template, tuple(thawer.thaw(base) for base in bases))
+        for key, parts in members:
+            member = vars(template)[key]
+            type.__setattr__(made, key, _put_together(member, _thaw_parts(thawer, parts, (MISSING,) * 3)))
+        return made
+
+    def copy(self, copier: Copier, obj: type) -> Any:
+        made = copier.enter(obj, _blank(obj, tuple(copier.copy(base) for base in obj.__bases__)))
+        for name, member in _members(obj):
+            parts = tuple(copier.copy(part) for part in _parts(member))
+            type.__setattr__(made, name, _put_together(member, parts))
+        return made
+
+
+def _thaw_parts(thawer: Thawer, parts: tuple[Any, ...], have: tuple[Any, ...]) -> tuple[Any, ...]:
+    return tuple(thawer.thaw(part, its) for part, its in zip(parts, have, strict=False))
+
+
+def _blank(cls: type, bases: tuple[type, ...]) -> Any:
+    """Make a class like another one, without its members."""
+    namespace = {name: vars(cls)[name] for name in _NOT_STATE & vars(cls).keys()}
+    for name in ("__dict__", "__weakref__", "_abc_impl", "__slotnames__"):
+        namespace.pop(name, None)
+    try:
+        return type.__new__(type(cls), cls.__name__, bases, namespace)
+    except Exception as error:
+        raise SnapshotUnsupportedError(
+            f"the class {class_name(cls)} is made inside a function and cannot be made again: {error}"
+        ) from error

@@ -1,0 +1,132 @@
+"""Tensors of torch: captured by value; those that share memory go on sharing it."""
+
+import sys
+from typing import Any
+
+import numpy as np
+
+from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
+from sb3_mcbs.snapshot.graph import MISSING, Copier, Freezer, Ref, Thawer, class_name
+
+
+def is_tensor(obj: Any) -> bool:
+    """Return whether an object is a tensor; does not import torch.
+
+    :param obj: any object.
+    """
+    torch = sys.modules.get("torch")
+    return torch is not None and isinstance(obj, torch.Tensor)
+
+
+def bytes_of(tensor: Any) -> np.ndarray:
+    """Return the whole memory that a tensor is a view of.
+
+    :param tensor: on the CPU.
+    """
+    torch: Any = sys.modules["torch"]
+    whole = torch.empty(0, dtype=torch.uint8, device=tensor.device).set_(tensor.untyped_storage())
+    return whole.cpu().numpy()
+
+
+class TensorKind:
+    """Tensors and parameters. Parameters are put back in place: optimizers hold them as well."""
+
+    name = "torch"
+
+    def freeze(self, freezer: Freezer, obj: Any) -> Any:
+        storage = _storage_of(obj)
+        freezer.tensors.append(obj)
+        shared = freezer.owner_of(storage, obj)
+        content = bytes_of(obj).copy() if shared is None else shared
+        return content, _layout(obj), freezer.freeze(obj.grad if obj.is_leaf else None)
+
+    def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
+        content, layout, grad = payload
+        if type(content) is Ref:
+            made = _tensor(thawer.thaw(content).untyped_storage(), layout)
+        elif _can_be_put_back(current, layout, content) and thawer.claim(current):
+            made = current
+            thawer.do_then(_write, current, content)
+        else:
+            made = _tensor(_storage(content, layout), layout)
+        thawer.memo[index] = made
+        have = made.grad if made is current and made.grad is not None else MISSING
+        thawed = thawer.thaw(grad, have)
+        if thawed is not made.grad:
+            thawer.do_then(setattr, made, "grad", thawed)
+        return made
+
+    def copy(self, copier: Copier, obj: Any) -> Any:
+        storage = _storage_of(obj)
+        if id(storage) not in copier.memo:
+            copier.enter(storage, storage.clone())
+        made = copier.enter(obj, _tensor(copier.memo[id(storage)], _layout(obj)))
+        made.grad = copier.copy(obj.grad if obj.is_leaf else None)
+        return made
+
+
+def _storage_of(tensor: Any) -> Any:
+    """Return the memory of a tensor.
+
+    :raises SnapshotUnsupportedError: if it cannot be captured.
+    """
+    torch: Any = sys.modules["torch"]
+    cls = type(tensor)
+    if cls not in (torch.Tensor, torch.nn.Parameter) or tensor.layout is not torch.strided:
+        raise SnapshotUnsupportedError(f"a {class_name(cls)} of layout {tensor.layout} is no plain tensor")
+    if tensor.grad_fn is not None:
+        raise SnapshotUnsupportedError("it is a tensor with a history of gradients; keep its detach()")
+    return tensor.untyped_storage()
+
+
+def check_memory(freezer: Freezer) -> None:
+    """Refuse tensors whose memory is that of a NumPy array: a restore would part the two.
+
+    :param freezer: has captured all that belongs together.
+    :raises SnapshotUnsupportedError: if there is one.
+    """
+    spans = [_span(tensor.untyped_storage()) for tensor in freezer.tensors if tensor.device.type == "cpu"]
+    for array in freezer.alive if spans else ():
+        if type(array) is np.ndarray and array.base is None and array.nbytes:
+            start = int(array.__array_interface__["data"][0])
+            if any(start < end and its_start < start + array.nbytes for its_start, end in spans):
+                raise SnapshotUnsupportedError(
+                    f"A tensor has the memory of a NumPy array of shape {array.shape} of the environment, as "
+                    "torch.from_numpy makes it, and a restore would part them. Keep the tensor's clone(), or "
+                    "keep the tensor alone and read it with tensor.numpy()."
+                )
+
+
+def _span(storage: Any) -> tuple[int, int]:
+    return storage.data_ptr(), storage.data_ptr() + storage.nbytes()
+
+
+def _layout(tensor: Any) -> tuple[Any, ...]:
+    """Return how a tensor lies in its memory, as plain values."""
+    is_parameter = isinstance(tensor, sys.modules["torch"].nn.Parameter)
+    place = tensor.storage_offset(), tuple(tensor.shape), tensor.stride()
+    dtype = str(tensor.dtype).removeprefix("torch.")
+    return is_parameter, dtype, str(tensor.device), tensor.requires_grad, *place
+
+
+def _can_be_put_back(current: Any, layout: tuple[Any, ...], content: np.ndarray) -> bool:
+    if not layout[0] or not is_tensor(current) or _layout(current) != layout:
+        return False
+    return current.untyped_storage().nbytes() == content.nbytes
+
+
+def _write(tensor: Any, content: np.ndarray) -> None:
+    torch: Any = sys.modules["torch"]
+    whole = torch.empty(0, dtype=torch.uint8, device=tensor.device).set_(tensor.untyped_storage())
+    whole.copy_(torch.tensor(content))
+
+
+def _storage(content: np.ndarray, layout: tuple[Any, ...]) -> Any:
+    return sys.modules["torch"].tensor(content, device=layout[2]).untyped_storage()
+
+
+def _tensor(storage: Any, layout: tuple[Any, ...]) -> Any:
+    torch: Any = sys.modules["torch"]
+    is_parameter, dtype, device, requires_grad, *place = layout
+    made = torch.empty(0, dtype=getattr(torch, dtype), device=device).set_(storage, *place)
+    return torch.nn.Parameter(made, requires_grad) if is_parameter else made.requires_grad_(requires_grad)

@@ -1,0 +1,306 @@
+"""Trust, but check: whether an environment really does the same again after a restore, and in a clone.
+
+What is captured of environments that are not known is all that Python can see. A simulator in compiled code
+behind an integer, a global, or a mutable class attribute is not among it, and nothing about the environment
+says so. So its first steps are compared, bit by bit.
+"""
+
+import copy
+import logging
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple, Protocol
+from weakref import WeakKeyDictionary
+
+import gymnasium as gym
+import numpy as np
+
+from sb3_mcbs.snapshot.errors import SnapshotError, SnapshotUnsupportedError
+from sb3_mcbs.snapshot.global_generators import globals_kept, seed_globals
+from sb3_mcbs.snapshot.graph import private_copy
+from sb3_mcbs.snapshot.layers import Layer, replaced_method
+from sb3_mcbs.snapshot.objects import attributes_of
+from sb3_mcbs.snapshot.registry import find_adapter
+from sb3_mcbs.snapshot.spaces import random_action
+
+logger = logging.getLogger("sb3_mcbs")
+
+#: Steps before the first snapshot, in each run that is compared, and before the second snapshot.
+WARM_UP, STEPS, BETWEEN = 3, 8, 6
+
+_KNOWN_ENVIRONMENTS = tuple(
+    f"gymnasium.envs.{part}." for part in ("mujoco", "classic_control", "box2d", "toy_text")
+)
+_KNOWN_WRAPPERS = ("gymnasium.wrappers.", "stable_baselines3.common.monitor.", "rl_zoo3.gym_patches.")
+#: They call a function that is not known.
+_CALLING_WRAPPERS = {
+    f"gymnasium.wrappers.{module}.{name}"
+    for module, name in (
+        ("transform_observation", "TransformObservation"),
+        ("transform_reward", "TransformReward"),
+        ("transform_action", "TransformAction"),
+    )
+}
+
+_WHAT_TO_DO = (
+    "State outside of Python objects, in globals or in class attributes cannot be seen. Say how it is "
+    "captured with sb3_mcbs.snapshot.register_adapter(...); if the environment always does the same from the "
+    "same seed, with a ReplayAdapter(). Without exact copies there are forward_model='ensemble', which "
+    "learns a model, and rollout_depth=0. SnapshotEnvWrapper(env, verify=False) leaves out this check."
+)
+
+#: Which environments passed: by the class of the innermost, how it was made and what is around it.
+_passed: "WeakKeyDictionary[type, set[Any]]" = WeakKeyDictionary()
+
+
+class Checked(Protocol):
+    """What is checked: an environment that can be captured."""
+
+    def capture(self) -> Any:
+        """Return its state."""
+
+    def put_back(self, state: Any) -> None:
+        """Put it into a captured state."""
+
+    def copy(self) -> "Checked":
+        """Return an independent copy in the present state."""
+
+    def reset(self) -> None:
+        """Reset it, always with the same seed."""
+
+    def step(self, action: Any) -> Any:
+        """Step it."""
+
+    def close(self) -> None:
+        """Close it, if it is a copy."""
+
+
+class Outcome(NamedTuple):
+    """What one step gave; ``raised`` says what it raised instead."""
+
+    observation: Any = None
+    reward: Any = None
+    terminated: Any = None
+    truncated: Any = None
+    raised: str | None = None
+
+    @property
+    def ends(self) -> bool:
+        """Whether no step can follow."""
+        return bool(self.raised or self.terminated or self.truncated)
+
+
+def is_known_exact(layers: Sequence[Layer], own_adapters: tuple[type, ...]) -> bool:
+    """Return whether the snapshots of an environment are exact by what is known of its classes.
+
+    :param layers: of the environment.
+    :param own_adapters: adapters that are part of this package.
+    """
+    for layer in layers:
+        adapter = find_adapter(layer.env)
+        if adapter is not None and type(adapter) not in own_adapters:
+            return False
+        known = _KNOWN_WRAPPERS if isinstance(layer.env, gym.Wrapper) else _KNOWN_ENVIRONMENTS
+        if not layer.recorder and (not layer.name.startswith(known) or layer.name in _CALLING_WRAPPERS):
+            return False
+        if replaced_method(layer.env) is not None:
+            return False
+    return True
+
+
+def has_passed(layers: Sequence[Layer]) -> bool:
+    """Return whether an environment of these classes, made the same way, was checked in this process.
+
+    :param layers: of the environment.
+    """
+    return _fingerprint(layers) in _passed.get(type(layers[-1].env), ())
+
+
+def _fingerprint(layers: Sequence[Layer]) -> Any:
+    base = layers[-1].env
+    made = None if base.spec is None else (base.spec.id, repr(base.spec.kwargs))
+    holds = tuple((name, type(value)) for name, value in attributes_of(base).items() if name != "_np_random")
+    return made, holds, tuple(type(layer.env) for layer in layers)
+
+
+def check_exact(checked: Checked, layers: Sequence[Layer], action_space: gym.Space) -> None:
+    """Compare what an environment does after a restore, and in a clone, with what it did before.
+
+    The environment is left somewhere; global generators are left as they were.
+
+    :param checked: the environment.
+    :param layers: its layers.
+    :param action_space: of the environment.
+    :raises SnapshotUnsupportedError: names what differed, and at which step.
+    """
+    start = time.perf_counter()
+    name = type(layers[-1].env).__name__
+    with globals_kept():
+        n_steps = _Check(checked, name, action_space).run()
+    _passed.setdefault(type(layers[-1].env), set()).add(_fingerprint(layers))
+    seconds = time.perf_counter() - start
+    logger.info("snapshots of %s were checked: exact in %d steps (%.2f s)", name, n_steps, seconds)
+
+
+class _Check:
+    def __init__(self, checked: Checked, name: str, action_space: gym.Space) -> None:
+        self._env = checked
+        self._name = name
+        self._sample = _sampler(action_space)
+        self._n_steps = 0
+
+    def run(self) -> int:
+        """Make the comparisons.
+
+        :return: how many steps they took.
+        """
+        if any(outcome.ends for outcome in self._reset(WARM_UP)):
+            self._reset(0)
+        actions, state = self._draw(STEPS), self._env.capture()
+        expected = self._steps(self._env, actions)
+        self._env.put_back(state)
+        self._compare(expected, self._steps(self._env, actions), "After a restore", self._repeats)
+        self._env.put_back(state)
+        copy_of_env = self._env.copy()
+        try:
+            self._check_copy(copy_of_env, actions, state, expected)
+            if not expected[-1].ends and not any(o.ends for o in self._steps(self._env, self._draw(BETWEEN))):
+                self._check_later(copy_of_env)
+        finally:
+            copy_of_env.close()
+        return self._n_steps
+
+    def _check_copy(
+        self, copy_of_env: Checked, actions: list[Any], state: Any, expected: list[Outcome]
+    ) -> None:
+        """Step a copy and the original in turns: each must do what it does alone."""
+        half = min(STEPS // 2, len(expected))
+        seen = self._steps(copy_of_env, actions[:half])
+        self._compare(expected[:half], seen, "In a clone")
+        original = self._steps(self._env, actions)
+        self._compare(expected, original, "After steps of a clone, which moved the original,")
+        if len(expected) > half:
+            rest = self._steps(copy_of_env, actions[half:], half)
+            self._compare(expected[half:], rest, "In a clone, which the original's steps moved,", first=half)
+        copy_of_env.put_back(state)
+        self._compare(expected, self._steps(copy_of_env, actions), "In a clone after a restore")
+
+    def _check_later(self, copy_of_env: Checked) -> None:
+        """The same from a state that is farther from the reset."""
+        actions, state = self._draw(STEPS), self._env.capture()
+        expected = self._steps(self._env, actions)
+        for env, where in ((self._env, "After a restore"), (copy_of_env, "In a clone after a restore")):
+            env.put_back(state)
+            self._compare(expected, self._steps(env, actions), f"{where} farther from the reset")
+
+    def _draw(self, n: int) -> list[Any]:
+        return [self._sample() for _ in range(n)]
+
+    def _reset(self, n_steps: int) -> list[Outcome]:
+        seed_globals(0)
+        self._env.reset()
+        return self._steps(self._env, self._draw(n_steps))
+
+    def _steps(self, env: Checked, actions: list[Any], first: int = 0) -> list[Outcome]:
+        outcomes: list[Outcome] = []
+        for number, action in enumerate(actions, first):
+            self._n_steps += 1
+            seed_globals(number)  # who draws from them draws the same
+            try:
+                observation, reward, terminated, truncated, _ = env.step(copy.deepcopy(action))
+                outcome = Outcome(private_copy(observation), reward, terminated, truncated)
+            except SnapshotError:
+                raise
+            except Exception as error:
+                outcome = Outcome(raised=f"{type(error).__name__}: {error}")
+            outcomes.append(outcome)
+            if outcome.ends:
+                break
+        return outcomes
+
+    def _repeats(self, actions: list[Any]) -> bool:
+        """Return whether the environment does the same from the same seed, without any restore."""
+        runs = []
+        for _ in range(2):
+            seed_globals(0)
+            self._env.reset()
+            runs.append(self._steps(self._env, actions))
+        return _first_difference(*runs) is None
+
+    def _compare(
+        self,
+        expected: list[Outcome],
+        seen: list[Outcome],
+        where: str,
+        repeats: Callable[[list[Any]], bool] | None = None,
+        first: int = 0,
+    ) -> None:
+        if expected[0].raised:
+            raise SnapshotUnsupportedError(
+                f"The snapshots of {self._name} could not be checked: its step raised {expected[0].raised}. "
+                "SnapshotEnvWrapper(env, verify=False) leaves out the check."
+            )
+        difference = _first_difference(expected, seen)
+        if difference is None:
+            return
+        step, what = difference
+        reason = f"{where} step {first + step + 1} of {self._name} gave {what}."
+        if repeats is not None and not repeats(self._draw(STEPS)):
+            reason += (
+                " It does not repeat itself after two resets with the same seed either: it draws random "
+                "numbers that no generator of its own gives, or remembers earlier episodes somewhere else."
+            )
+        raise SnapshotUnsupportedError(f"{reason} {_WHAT_TO_DO}")
+
+
+def _sampler(space: gym.Space) -> Callable[[], Any]:
+    if isinstance(space, gym.spaces.Box):
+        rng = np.random.default_rng(0)
+        return lambda: random_action(space, rng)
+    own = copy.deepcopy(space)
+    own.seed(0)
+    return own.sample
+
+
+def _first_difference(expected: list[Outcome], seen: list[Outcome]) -> tuple[int, str] | None:
+    """Find the first step in which two runs differ.
+
+    :return: its number, and what differed in words; None if nothing did.
+    """
+    for step, (one, other) in enumerate(zip(expected, seen, strict=False)):
+        for name in Outcome._fields:
+            for path, value, its in _leaves(getattr(one, name), getattr(other, name), name):
+                if not _is_same(value, its):
+                    return step, _in_words(path, value, its)
+    if len(expected) != len(seen):
+        return min(len(expected), len(seen)), "no result, or one where there was none"
+    return None
+
+
+def _leaves(one: Any, other: Any, path: str) -> Iterator[tuple[str, Any, Any]]:
+    """Go through two values of the same structure; where it differs they are leaves themselves."""
+    if isinstance(one, dict) and isinstance(other, dict) and one.keys() == other.keys():
+        for key in one:
+            yield from _leaves(one[key], other[key], f"{path}[{key!r}]")
+    elif isinstance(one, tuple | list) and isinstance(other, tuple | list) and len(one) == len(other):
+        for place in range(len(one)):
+            yield from _leaves(one[place], other[place], f"{path}[{place}]")
+    else:
+        yield path, one, other
+
+
+def _is_same(one: Any, other: Any) -> bool:
+    one, other = np.asarray(one), np.asarray(other)
+    if one.dtype != other.dtype or one.shape != other.shape:
+        return False
+    return bool(np.array_equal(one, other)) if one.dtype.hasobject else one.tobytes() == other.tobytes()
+
+
+def _in_words(path: str, one: Any, other: Any) -> str:
+    one, other = np.asarray(one), np.asarray(other)
+    if one.shape == other.shape and one.ndim and one.dtype == other.dtype and not one.dtype.hasobject:
+        places = np.argwhere([not _is_same(a, b) for a, b in zip(one.ravel(), other.ravel(), strict=True)])
+        index = np.unravel_index(int(places[0, 0]), one.shape)
+        path += f"[{', '.join(map(str, index))}]"
+        one, other = one[index], other[index]
+    return f"{path} = {other} instead of {one}"
