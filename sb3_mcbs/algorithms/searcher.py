@@ -350,11 +350,15 @@ class Searcher:
         :param envs: which environments.
         """
         assert self.model is not None
+        known = self.model.deterministic
         try:
-            return self.model.read_roots(envs)
+            roots = self.model.read_roots(envs)
         except ForwardModelError as reason:  # the environment exchanged its simulator
             self._follow_environment(f"{reason} ")
             return self.model.read_roots(envs)
+        if self.model.deterministic != known:  # what needs a reset with options shows only after it
+            check_dynamics(self.settings, self.model.deterministic)
+        return roots
 
     def _follow_environment(self, message: str) -> None:
         """Make the forward model what the environments are now.
@@ -366,7 +370,10 @@ class Searcher:
         assert self.model is not None
         if self.model.kind == "pool":
             self.model.deterministic = False
-            self._warn(message + "Its dynamics are random; every simulation now draws its own randomness.")
+            self._warn(
+                message + "So it draws random numbers in some states, or part of its state is not captured. "
+                "Every simulation now draws its own randomness."
+            )
             check_dynamics(self.settings, deterministic=False)
             return
         if not self._previous_step_differed:

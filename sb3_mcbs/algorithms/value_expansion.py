@@ -233,7 +233,7 @@ class ValueExpansion:
             terminated[at] = step.terminated[valid]
             lengths[at] += 1
             put_rows(last, at, searcher.view.observe(step.observations, normalize=False), valid)
-            still = np.flatnonzero(step.valid & ~step.terminated)
+            still = np.flatnonzero(step.goes_on)
             if not len(still):
                 return
             seen = take_rows(searcher.view.observe(step.observations), still)

@@ -25,12 +25,21 @@ class Transition(NamedTuple):
     :param terminated: ``[rows]`` bool. A ``TimeLimit`` never shows here.
     :param valid: ``[rows]`` bool. False where the simulation diverged: nothing else that the row
         says may be used, and stepping it again has no meaning.
+    :param stopped: ``[rows]`` bool, or ``None`` for nowhere. True where the environment itself truncated the
+        episode: no step can follow, but the state is no terminal one, and a value closes the simulation.
     """
 
     observations: Observations
     rewards: np.ndarray
     terminated: np.ndarray
     valid: np.ndarray
+    stopped: np.ndarray | None = None
+
+    @property
+    def goes_on(self) -> np.ndarray:
+        """``[rows]`` bool, whether a row can be stepped further."""
+        goes_on = self.valid & ~self.terminated
+        return goes_on if self.stopped is None else goes_on & ~self.stopped
 
 
 class ForwardModel(ABC):

@@ -7,10 +7,11 @@ from contextlib import nullcontext
 from typing import Any
 from weakref import WeakKeyDictionary
 
+import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_mcbs.models.base import Observations
+from sb3_mcbs.models.base import ForwardModelError, Observations
 from sb3_mcbs.models.probing import Randomness, probe_randomness
 from sb3_mcbs.snapshot import (
     SIMULATION_DIVERGED,
@@ -46,23 +47,34 @@ def _is_finite(observation: Any) -> bool:
     return all(bool(np.isfinite(v).all()) for v in values if np.issubdtype(v.dtype, np.inexact))
 
 
+def _is_at_time_limit(layer: Any) -> bool:
+    """Whether a ``TimeLimit``, Gymnasium's or RL Zoo's, has ended the episode."""
+    while isinstance(layer, gym.Wrapper):
+        elapsed, limit = (getattr(layer, name, None) for name in ("_elapsed_steps", "_max_episode_steps"))
+        if elapsed is not None and limit is not None and elapsed >= limit:
+            return True
+        layer = layer.env
+    return False
+
+
 class _Row:
     """One copy, and what its last step gave.
 
-    :ivar ended: no further steps: the episode terminated, or the simulation is of no use.
+    :ivar ended: no further steps: the episode ended, or the simulation is of no use.
+    :ivar stopped: the environment itself truncated the episode.
     """
 
     def __init__(self, env: SnapshotEnvWrapper) -> None:
         self.env = env
         self.observation = _blank(env.observation_space)
         self.reward = 0.0
-        self.ended = self.terminated = False
+        self.ended = self.terminated = self.stopped = False
         self.valid = True
 
     def start(self, snapshot: Snapshot, rng: np.random.Generator) -> None:
         """Restore a snapshot, with random generators of the look-ahead's own."""
         self.env.restore(snapshot, rng=rng)
-        self.ended = self.terminated = False
+        self.ended = self.terminated = self.stopped = False
         self.valid = True
 
     def become(self, other: "_Row", snapshot: Snapshot | None, rng: np.random.Generator) -> None:
@@ -76,6 +88,7 @@ class _Row:
             self.env.restore(snapshot, rng=rng)
         self.observation, self.reward = other.observation, other.reward
         self.ended, self.terminated, self.valid = other.ended, other.terminated, other.valid
+        self.stopped = other.stopped
 
     def step(self, action: np.ndarray) -> Exception | None:
         """Step the copy once, unless it has ended.
@@ -87,24 +100,28 @@ class _Row:
         if self.ended:
             return None
         try:
-            observation, reward, terminated, _, info = self.env.step(action.copy())
+            observation, reward, terminated, truncated, info = self.env.step(action.copy())
         except Exception as error:
             self.ended, self.valid = True, False
             return error
         self.observation, self.reward, self.terminated = _copied(observation), float(reward), bool(terminated)
         finite = _is_finite(self.observation) and bool(np.isfinite(self.reward))
         self.valid = finite and SIMULATION_DIVERGED not in info
-        # Truncation is left out on purpose: a time limit does not end a simulation.
-        self.ended = self.terminated or not self.valid
+        # A time limit does not end a simulation. An environment that ends an episode itself may not go on.
+        self.stopped = bool(truncated) and self.valid and not _is_at_time_limit(self.env)
+        self.ended = self.terminated or self.stopped or not self.valid
         return None
 
 
 class Copies:
-    """The rows of one environment."""
+    """The rows of one environment, and the states that they may start from."""
 
     def __init__(self) -> None:
         #: Whether the environment draws from the global generators.
         self.isolate = False
+        #: By number. Snapshots are large, and stay where the environment lives.
+        self.roots: dict[int, Snapshot] = {}
+        self._n_roots = 0
         self.rows: list[_Row] = []
         self._spare: list[_Row] = []
         self._rng = np.random.default_rng(0)
@@ -112,15 +129,29 @@ class Copies:
     def _take(self, wrapper: SnapshotEnvWrapper) -> _Row:
         return self._spare.pop() if self._spare else _Row(wrapper.clone())
 
-    def set_rows(
-        self, wrapper: SnapshotEnvWrapper, snapshots: list[Snapshot], counts: list[int], seed: int
-    ) -> None:
-        """Make ``counts[i]`` rows that start at ``snapshots[i]``."""
+    def keep_root(self, wrapper: SnapshotEnvWrapper, dropped: list[int]) -> int:
+        """Keep the environment's present state.
+
+        :param dropped: the numbers of those that nobody needs any longer.
+        :return: its number.
+        """
+        for number in dropped:
+            self.roots.pop(number, None)
+        self._n_roots += 1
+        self.roots[self._n_roots] = wrapper.snapshot(monitor=False)
+        return self._n_roots
+
+    def set_rows(self, wrapper: SnapshotEnvWrapper, roots: list[int], counts: list[int], seed: int) -> None:
+        """Make ``counts[i]`` rows that start at the state with the number ``roots[i]``."""
+        missing = [number for number in roots if number not in self.roots]
+        if missing:
+            raise ForwardModelError("the roots are from before the model was refreshed: read them again")
+        snapshots = [self.roots[number] for number in roots]
         try:
             self._start_rows(wrapper, snapshots, counts, seed)
         except SnapshotMismatchError:
             # The environment has exchanged its simulator since it was copied.
-            self.close()
+            self._close_rows()
             self._start_rows(wrapper, snapshots, counts, seed)
 
     def _start_rows(
@@ -154,12 +185,14 @@ class Copies:
             chosen.append(row)
         self.rows = chosen
 
-    def step(self, actions: np.ndarray) -> tuple[list[Any], np.ndarray, np.ndarray, np.ndarray, str]:
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[list[Any], np.ndarray, np.ndarray, np.ndarray, np.ndarray, str]:
         """Step every row.
 
         :param actions: ``[rows, *act_shape]``.
-        :return: observations (one per row), rewards, terminated and valid ``[rows]``, and the first
-            error that an environment raised.
+        :return: observations (one per row), rewards, terminated, valid and stopped ``[rows]``, and the
+            first error that an environment raised.
         """
         isolation = isolated_globals(int(self._rng.integers(2**32))) if self.isolate else nullcontext()
         with isolation:
@@ -169,13 +202,18 @@ class Copies:
         rewards = np.array([row.reward for row in self.rows])
         terminated = np.array([row.terminated for row in self.rows], dtype=bool)
         valid = np.array([row.valid for row in self.rows], dtype=bool)
-        return observations, rewards, terminated, valid, messages[0] if messages else ""
+        stopped = np.array([row.stopped for row in self.rows], dtype=bool)
+        return observations, rewards, terminated, valid, stopped, messages[0] if messages else ""
 
-    def close(self) -> None:
-        """Close every copy."""
+    def _close_rows(self) -> None:
         for row in (*self.rows, *self._spare):
             row.env.close()
         self.rows, self._spare = [], []
+
+    def close(self) -> None:
+        """Close every copy, and forget all states."""
+        self._close_rows()
+        self.roots.clear()
 
 
 # A pool's copies of an environment, next to it: in a worker process nothing else could hold them.
@@ -187,13 +225,14 @@ def copies_of(wrapper: SnapshotEnvWrapper, pool: str) -> Copies:
     return _COPIES.setdefault(wrapper, {}).setdefault(pool, Copies())
 
 
-def open_copies(wrapper: SnapshotEnvWrapper, pool: str) -> Randomness:
+def open_copies(wrapper: SnapshotEnvWrapper, pool: str) -> Randomness | None:
     """Prepare to keep copies of an environment.
 
-    :return: what random numbers its steps use.
+    :return: what random numbers its steps use; ``None`` if that can only be said after its first reset.
+    :raises SnapshotUnsupportedError: if it cannot be copied exactly.
     """
     randomness = probe_randomness(wrapper)
-    copies_of(wrapper, pool).isolate = randomness.shared
+    copies_of(wrapper, pool).isolate = randomness is not None and randomness.shared
     return randomness
 
 
@@ -219,6 +258,6 @@ def drop_copies(wrapper: SnapshotEnvWrapper, pool: str) -> None:
         copies.close()
 
 
-def read_snapshot(wrapper: SnapshotEnvWrapper) -> Snapshot:
-    """The environment's present state, for copies of it."""
-    return wrapper.snapshot(monitor=False)
+def keep_root(wrapper: SnapshotEnvWrapper, pool: str, dropped: list[int]) -> int:
+    """:meth:`Copies.keep_root`, next to the environment."""
+    return copies_of(wrapper, pool).keep_root(wrapper, dropped)

@@ -5,15 +5,16 @@ import logging
 import uuid
 from collections.abc import Callable, Sequence
 from itertools import groupby
-from typing import Any, NamedTuple
+from typing import Any
+from weakref import finalize
 
 import numpy as np
 
 from sb3_mcbs.models.base import ForwardModel, ForwardModelError, Transition
 from sb3_mcbs.models.copies import (
     drop_copies,
+    keep_root,
     open_copies,
-    read_snapshot,
     select_rows,
     set_rows,
     stack,
@@ -21,14 +22,17 @@ from sb3_mcbs.models.copies import (
 )
 from sb3_mcbs.models.environments import Environments
 from sb3_mcbs.models.workers import WorkerError
-from sb3_mcbs.snapshot import Snapshot
 
 logger = logging.getLogger("sb3_mcbs")
 
 
-class _Root(NamedTuple):
-    env_index: int
-    snapshot: Snapshot
+class _Root:
+    """Stands for a state that is kept next to its environment, as long as this object lives."""
+
+    def __init__(self, env_index: int, number: int, dropped: list[int]) -> None:
+        self.env_index = env_index
+        self.number = number
+        finalize(self, dropped.append, number).atexit = False
 
 
 class EnvPoolModel(ForwardModel):
@@ -36,10 +40,12 @@ class EnvPoolModel(ForwardModel):
 
     Copies live where their environment lives: with a ``SubprocVecEnv`` the workers simulate, at the
     same time. A row that terminated or became invalid is not stepped further: it keeps its last
-    observation and ``terminated``, and its reward is 0. The copies go when the pool is closed or
+    observation and ``terminated``, and its reward is 0. So does one whose episode the environment itself
+    truncated (``stopped``), but not at a ``TimeLimit``. The copies go when the pool is closed or
     collected; those of workers then stay until the next look-ahead.
 
     :param environments: the real environments.
+    :raises SnapshotUnsupportedError: if one of them cannot be copied exactly.
 
     :ivar deterministic: found out by stepping copies; may be set to False by whoever knows better.
     :ivar kind: "pool".
@@ -54,18 +60,26 @@ class EnvPoolModel(ForwardModel):
         #: Which environments have rows, and how many.
         self._counts: dict[int, int] = {}
         self._warned = False
+        #: Numbers of states that are kept next to the environments and that nobody needs, by environment.
+        self._dropped: list[list[int]] = [[] for _ in range(len(environments))]
         environments.when_gone(self, drop_copies, self._name)
         self.refresh()
-        kind = "deterministic" if self.deterministic else "random"
-        self.description = f"pool of environment copies ({kind} dynamics)"
 
     @property
     def n_rows(self) -> int:
         return sum(self._counts.values())
 
     def read_roots(self, env_indices: Sequence[int]) -> list[Any]:
-        snapshots = self._environments.apply(env_indices, read_snapshot)
-        return [_Root(int(i), snapshot) for i, snapshot in zip(env_indices, snapshots, strict=True)]
+        if self._is_unknown:  # the environments have been reset by now
+            self.refresh()
+        dropped = [self._dropped[int(i)] for i in env_indices]
+        args = [(self._name, [*numbers]) for numbers in dropped]
+        for numbers in dropped:
+            numbers.clear()
+        kept = self._environments.apply_each(env_indices, keep_root, args)
+        return [
+            _Root(int(i), number, self._dropped[int(i)]) for i, number in zip(env_indices, kept, strict=True)
+        ]
 
     def set_roots(self, roots: Sequence[Any], index: np.ndarray, rng: np.random.Generator) -> None:
         per_root = np.bincount(index, minlength=len(roots)).tolist()
@@ -76,7 +90,7 @@ class EnvPoolModel(ForwardModel):
             numbers = list(group)
             # Rows whose dynamics are not random need no randomness of the caller's.
             seed = 0 if self.deterministic else int(rng.integers(2**63))
-            args[env_index] = ([roots[i].snapshot for i in numbers], [per_root[i] for i in numbers], seed)
+            args[env_index] = ([roots[i].number for i in numbers], [per_root[i] for i in numbers], seed)
         self._each(set_rows, args)
         self._counts = {env_index: sum(counts) for env_index, (_, counts, _) in args.items()}
 
@@ -96,7 +110,7 @@ class EnvPoolModel(ForwardModel):
         parts = np.split(actions, np.cumsum(list(self._counts.values()))[:-1])
         args = {i: (part,) for i, part in zip(self._counts, parts, strict=True) if len(part)}
         results = self._each(step_rows, args)
-        errors = [result[4] for result in results if result[4]]
+        errors = [result[5] for result in results if result[5]]
         if errors and not self._warned:
             self._warned = True
             logger.warning(
@@ -104,14 +118,22 @@ class EnvPoolModel(ForwardModel):
                 errors[0],
             )
         observations = stack([observation for result in results for observation in result[0]])
-        rewards, terminated, valid = (np.concatenate([result[k] for result in results]) for k in (1, 2, 3))
-        return Transition(observations, rewards, terminated, valid)
+        rewards, terminated, valid, stopped = (
+            np.concatenate([result[k] for result in results]) for k in (1, 2, 3, 4)
+        )
+        return Transition(observations, rewards, terminated, valid, stopped if stopped.any() else None)
 
     def refresh(self) -> None:
         # New copies carry what the environments' simulators are now.
         self.close()
         found = self._environments.apply(range(len(self._environments)), open_copies, self._name)
-        self.deterministic = not any(randomness.any for randomness in found)
+        self._is_unknown = any(randomness is None for randomness in found)
+        self.deterministic = not any(randomness is not None and randomness.any for randomness in found)
+        if self._is_unknown:
+            kind = "dynamics that show after the first reset"
+        else:
+            kind = f"{'deterministic' if self.deterministic else 'random'} dynamics"
+        self.description = f"pool of environment copies ({kind})"
 
     def close(self) -> None:
         # Worker processes that have ended took their copies with them.

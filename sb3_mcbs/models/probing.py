@@ -1,15 +1,17 @@
-"""Random numbers in a look-ahead: whether there are any, and keeping global ones out of it."""
+"""Random numbers in a look-ahead: whether the steps of an environment draw any."""
 
+import logging
 import sys
 from typing import Any, NamedTuple
 
-import gymnasium as gym
 import numpy as np
 
-from sb3_mcbs.snapshot import SnapshotEnvWrapper
-from sb3_mcbs.snapshot.generators import get_state, is_generator
+from sb3_mcbs.snapshot import SnapshotAdapter, SnapshotEnvWrapper, SnapshotError, SnapshotUnsupportedError
 from sb3_mcbs.snapshot.global_generators import global_states, isolated_globals
+from sb3_mcbs.snapshot.registry import find_adapter
 from sb3_mcbs.snapshot.spaces import random_action
+
+logger = logging.getLogger("sb3_mcbs")
 
 _STARTS, _STEPS = 3, 12
 
@@ -25,6 +27,23 @@ class Randomness(NamedTuple):
     shared: bool
 
 
+def verify_if_possible(wrapper: SnapshotEnvWrapper) -> bool:
+    """Check the snapshots of an environment, see :meth:`SnapshotEnvWrapper.verify`.
+
+    :param wrapper: the environment.
+    :return: False if it cannot be reset yet, as without ``options``.
+    :raises SnapshotUnsupportedError: if it does not pass.
+    """
+    try:
+        wrapper.verify()
+    except SnapshotError:
+        raise
+    except Exception as error:
+        logger.debug("cannot check %s yet: %s: %s", wrapper, type(error).__name__, error)
+        return False
+    return True
+
+
 def _comparable(state: Any) -> str:
     with np.printoptions(threshold=sys.maxsize):
         return repr(state)
@@ -36,55 +55,99 @@ def _shared_generators() -> list[str]:
     return [_comparable(state) for state in (python_state, numpy_state, torch_numbers)]
 
 
-def _own_generators(env: gym.Env) -> list[str]:
-    """The states of the generators that an environment and its wrappers hold."""
-    states: list[str] = []
-    layer: Any = env
-    while layer is not None:
-        states += [_comparable(get_state(value)) for value in vars(layer).values() if is_generator(value)]
-        layer = layer.env if isinstance(layer, gym.Wrapper) else None
-    return states
+def _own_generators(env: SnapshotEnvWrapper) -> list[str]:
+    """The states of all generators that are captured with an environment."""
+    nodes = env.snapshot(monitor=False).nodes
+    return [_comparable(payload[2:]) for kind, payload in nodes if kind == "generator"]
 
 
-def _run(env: SnapshotEnvWrapper, seed: int) -> list[Any]:
-    """What random actions give; the actions depend on the seed alone."""
-    rng = np.random.default_rng(seed)
-    seen: list[Any] = []
-    for _ in range(_STEPS):
-        observation, reward, terminated, _, _ = env.step(random_action(env.action_space, rng))
-        values = observation.values() if isinstance(observation, dict) else (observation,)
-        seen.append(([np.asarray(value).tobytes() for value in values], float(reward), bool(terminated)))
-        if terminated:
-            break
-    return seen
+def _draws_elsewhere(env: SnapshotEnvWrapper) -> bool:
+    """Whether an adapter has a generator of its own, which only the adapter can see."""
+    adapters = [find_adapter(obj) for obj in env.simulators]
+    return any(type(adapter).reseed is not SnapshotAdapter.reseed for adapter in adapters if adapter)
 
 
-def probe_randomness(wrapper: SnapshotEnvWrapper) -> Randomness:
+class _Probe:
+    """Steps a copy of an environment with two seeds for all that draws.
+
+    :param env: the copy.
+    """
+
+    def __init__(self, env: SnapshotEnvWrapper) -> None:
+        self._env = env
+        self.differs = self.own = self.shared = False
+
+    def look(self, seed: int) -> None:
+        """Look from the copy's present state on.
+
+        :param seed: of the actions.
+        """
+        env, runs = self._env, []
+        snapshot = env.snapshot()
+        for draws in (1, 2):
+            with isolated_globals(draws):
+                env.restore(snapshot, rng=np.random.default_rng(draws))
+                own, common = _own_generators(env), _shared_generators()
+                runs.append(self._run(seed))
+                self.shared = self.shared or _shared_generators() != common
+                self.own = self.own or _own_generators(env) != own
+        self.differs = self.differs or runs[0] != runs[1]
+
+    def _run(self, seed: int) -> list[Any]:
+        """What random actions give; the actions depend on the seed alone."""
+        rng = np.random.default_rng(seed)
+        seen: list[Any] = []
+        for _ in range(_STEPS):
+            try:
+                result = self._env.step(random_action(self._env.action_space, rng))
+            except Exception as error:
+                return [*seen, f"{type(error).__name__}: {error}"]
+            observation, reward, terminated, truncated, _ = result
+            values = observation.values() if isinstance(observation, dict) else (observation,)
+            seen.append(([np.asarray(value).tobytes() for value in values], repr(reward), bool(terminated)))
+            if terminated or truncated:
+                break
+        return seen
+
+
+def probe_randomness(wrapper: SnapshotEnvWrapper) -> Randomness | None:
     """Step a copy of the environment: do steps leave all generators alone, and can they be repeated?
 
     A probe is no proof: an environment that draws random numbers only in rare states can pass.
 
     :param wrapper: the environment, left as it is.
-    :return: what was found. Steps that fail count as random.
+    :return: what was found; ``None`` if the environment cannot be reset yet, as without ``options``.
+    :raises SnapshotUnsupportedError: if steps cannot be repeated although nothing was drawn: then part of the
+        state is not captured.
     """
-    found = shared = False
+    if not verify_if_possible(wrapper):
+        return None
     copied = wrapper.clone()
     try:
+        probe = _Probe(copied)
         for start in range(_STARTS):
-            copied.reset(seed=start)
-            snapshot = copied.snapshot()
-            runs = []
-            for seed in (1, 2):
-                with isolated_globals(seed):
-                    copied.restore(snapshot, rng=np.random.default_rng(seed))
-                    own, common = _own_generators(copied), _shared_generators()
-                    runs.append(_run(copied, start))
-                    shared = shared or _shared_generators() != common
-                    found = found or _own_generators(copied) != own
-            # NaN is not equal to itself, so that a simulation that fails counts as random.
-            found = found or runs[0] != runs[1]
-    except Exception:
-        found = True
+            try:
+                copied.reset(seed=start, options=wrapper.reset_arguments["options"])
+            except Exception:
+                return None
+            probe.look(start)
+        drawn = probe.own or probe.shared
+        if probe.differs and not drawn and not _draws_elsewhere(copied):
+            _refuse(wrapper)
     finally:
         copied.close()
-    return Randomness(found or shared, shared)
+    return Randomness(drawn or probe.differs, probe.shared)
+
+
+def _refuse(wrapper: SnapshotEnvWrapper) -> None:
+    name = type(wrapper.unwrapped).__name__
+    reason = (
+        f"The steps of {name} do not repeat themselves after a restore, although no random generator moved: "
+        "part of its state is not captured, or it draws from one that is not known."
+    )
+    if wrapper.verifies:
+        raise SnapshotUnsupportedError(
+            f"{reason} Say how it is captured with sb3_mcbs.snapshot.register_adapter(...), or learn a model "
+            "with forward_model='ensemble'. With SnapshotEnvWrapper(env, verify=False) it counts as random."
+        )
+    logger.warning("%s It is taken for random dynamics, as verify=False asks for.", reason)

@@ -17,6 +17,7 @@ from sb3_mcbs.search.interface import (
     SearchResult,
     map_arrays,
     put_rows,
+    stopped_values,
     take_rows,
 )
 from sb3_mcbs.search.proposals import (
@@ -187,8 +188,11 @@ def rollout_values(
         discount *= agent.gamma
 
         rows: np.ndarray | None = None  # which of the model's rows go on, if not all as they are
-        if not all_valid or step.terminated.any():
-            rows = np.flatnonzero(step.valid & ~step.terminated)
+        if step.stopped is not None:
+            stopped, values = stopped_values(step, agent)
+            returns[np.arange(len(returns))[unfinished][stopped]] += discount * values
+        if not all_valid or step.terminated.any() or step.stopped is not None:
+            rows = np.flatnonzero(step.goes_on)
             if not len(rows):
                 break
             unfinished = np.arange(len(returns))[unfinished][rows]

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_mcbs.models.base import Observations
+from sb3_mcbs.models.base import Observations, Transition
 
 
 class Agent(NamedTuple):
@@ -111,6 +111,21 @@ class SearchResult(NamedTuple):
     critic_evaluations: int = 0
     surviving_roots: np.ndarray | None = None
     rollouts: Rollouts | None = None
+
+
+def stopped_values(step: Transition, agent: Agent) -> tuple[np.ndarray, np.ndarray]:
+    """Value the rows of a step whose episode the environment itself truncated.
+
+    :param step: ``[rows]``, with ``stopped``.
+    :param agent: its critics value what its policy would do there.
+    :return: which rows ``[n]``, and their values ``[n]`` in float64.
+    """
+    assert step.stopped is not None
+    rows = np.flatnonzero(step.stopped & step.valid & ~step.terminated)
+    if not len(rows):
+        return rows, np.zeros(0)
+    observations = take_rows(step.observations, rows)
+    return rows, agent.value(observations, agent.policy(observations)).astype(np.float64)
 
 
 def map_arrays(function: Callable[[np.ndarray], Any], observations: Observations) -> Any:

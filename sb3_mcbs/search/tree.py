@@ -13,7 +13,7 @@ import numpy as np
 from sb3_mcbs.models.base import ForwardModel, Observations
 from sb3_mcbs.search.beam import choose
 from sb3_mcbs.search.directions import low_dimensional
-from sb3_mcbs.search.interface import Agent, FirstStep, SearchResult, take_rows
+from sb3_mcbs.search.interface import Agent, FirstStep, SearchResult, stopped_values, take_rows
 from sb3_mcbs.search.proposals import (
     best,
     clip_actions,
@@ -236,7 +236,10 @@ def _grow(
             first_step = FirstStep(take_rows(step.observations, slice(None)), step.rewards.copy())
         rewards = np.where(step.valid, agent.scale_reward(step.rewards), np.nan)
         totals[running] += agent.gamma ** (steps_before + number) * rewards
-        goes_on = step.valid & ~step.terminated
+        if step.stopped is not None:
+            stopped, values = stopped_values(step, agent)
+            totals[running[stopped]] += agent.gamma ** (steps_before + number + 1) * values
+        goes_on = step.goes_on
         view = _look(step.observations, goes_on, agent, actions.shape[1])
         stepping, running = running, running[goes_on]
         if not len(running):

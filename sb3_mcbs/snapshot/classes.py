@@ -201,6 +201,7 @@ def _thaw_parts(thawer: Thawer, parts: tuple[Any, ...], have: tuple[Any, ...]) -
 def _blank(cls: type, bases: tuple[type, ...]) -> Any:
     """Make a class like another one, without its members."""
     namespace = {name: vars(cls)[name] for name in _NOT_STATE & vars(cls).keys()}
+    namespace["__qualname__"] = cls.__qualname__
     for name in ("__dict__", "__weakref__", "_abc_impl", "__slotnames__"):
         namespace.pop(name, None)
     try:

@@ -91,7 +91,15 @@ def is_defined_as(space: spaces.Space, definition: Definition) -> bool:
     :param space: the space.
     :param definition: what :func:`definition_of` returned.
     """
-    return _equal(definition_of(space), definition)
+    own = definition_of(space)
+    if own is definition:
+        return True
+    if not _equal(own, definition):
+        return False
+    known = _cached.get(id(space))
+    if known is not None:  # the next comparison sees that they are the same
+        _cached[id(space)] = (*known[:3], definition)
+    return True
 
 
 def _equal(left: Any, right: Any) -> bool:

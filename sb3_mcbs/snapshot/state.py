@@ -99,6 +99,12 @@ class Stack:
         """Whether a clone is not yet in the state of the original."""
         return any(adapter.with_attributes for adapter in self._adapters.values())
 
+    @property
+    def simulators(self) -> list[Any]:
+        """The objects and layers that adapters capture."""
+        adapted = [layer.env for layer in self.layers if id(layer.env) in self._adapters]
+        return [*(self._watched or ()), *adapted]
+
     def freeze(self, monitor: bool = True) -> tuple[tuple[FrozenLayer, ...], tuple[Node, ...]]:
         """Capture the state.
 

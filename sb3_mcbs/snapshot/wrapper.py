@@ -52,9 +52,9 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
         env.restore(state)
         again = env.step(action)  # equal to first, bit for bit
 
-    An environment that is not known to be exact is checked when it is first used, usually in its first reset:
-    a few dozen steps from a seeded reset must repeat themselves after a restore and in a clone, bit for bit.
-    This happens once per class and spec in a process, and the environment is then as it was.
+    An environment that is not known to be exact is checked before its first snapshot, restore or clone: a few
+    dozen steps from a seeded reset must repeat themselves after a restore and in a clone, bit for bit. This
+    happens once per class and spec in a process, and the environment is then as it was.
 
     :param env: the environment with its wrappers.
     :param verify: False leaves out that check.
@@ -65,6 +65,10 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
     last_observation: Any
     #: How often the environment was reset or restored, and the steps since then. Not part of snapshots.
     moment: tuple[int, int]
+    #: The seed and the options of the last reset; the last seed that was given. Not part of snapshots.
+    reset_arguments: dict[str, Any]
+    #: Whether the environment is checked, if it is not known to be exact.
+    verifies: bool
     _verified: bool
 
     def __new__(cls, env: Any = None, verify: bool = True) -> "SnapshotEnvWrapper":
@@ -76,13 +80,16 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
         if not isinstance(verify, bool):
             raise TypeError(f"verify must be True or False, got {verify!r}")
         if env is self:
+            self.verifies = self.verifies and verify
             self._verified = self._verified or not verify
             return
         gym.utils.RecordConstructorArgs.__init__(self, verify=verify)
         gym.Wrapper.__init__(self, env)
         self.last_observation = None
         self.moment = (0, 0)
+        self.reset_arguments = {"seed": None, "options": None}
         self._stack = Stack(self)
+        self.verifies = verify
         self._verified = not verify
         self._spaces = (describe_space(self.observation_space), describe_space(self.action_space))
         # Whatever cannot be captured is better known before training than in the middle of it.
@@ -105,51 +112,47 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
         :param seed: as in Gymnasium.
         :param options: as in Gymnasium.
         :return: observation and info.
-        :raises SnapshotUnsupportedError: if the environment is checked first and does not pass, see above. It
-            is reset all the same.
         """
-        self.verify(seed, options)
-        return self._reset(seed, options)
-
-    def _reset(self, seed: int | None, options: dict[str, Any] | None) -> tuple[Any, dict[str, Any]]:
+        self.reset_arguments = {
+            "seed": self.reset_arguments["seed"] if seed is None else seed,
+            "options": options,
+        }
         observation, info = self.env.reset(seed=seed, options=options)
         self.last_observation = private_copy(observation)
         self.moment = (self.moment[0] + 1, 0)
         self._stack.find_simulators()
         return observation, info
 
-    def verify(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
+    def verify(self) -> None:
         """Check that snapshots of this environment are exact, if that is not known already.
 
         The environment is then as it was, in the middle of an episode, too. Neither a ``Monitor`` nor global
         generators notice.
 
-        :param seed: of the reset that the check begins with; None: 0.
-        :param options: of that reset.
         :raises SnapshotUnsupportedError: if part of it cannot be captured, or it does not do the same after a
-            restore or in a clone. It is reset then.
+            restore or in a clone. It is reset then, as it was reset last.
         """
         if self._verified:
             return
         layers = self._stack.layers
         if not is_known_exact(layers, (Box2DAdapter,)) and not has_passed(layers):
             try:
-                self._check(seed, options)
+                self._check()
             except SnapshotUnsupportedError:
                 with contextlib.suppress(Exception):  # the error that is raised says more
-                    self._reset(seed, options)
+                    self.reset(**private_copy(self.reset_arguments))
                 raise
         self._verified = True
 
-    def _check(self, seed: int | None, options: dict[str, Any] | None) -> None:
+    def _check(self) -> None:
         stack = self._stack
-        state = stack.freeze(monitor=False)
+        layers, nodes = stack.freeze(monitor=False)
         with stack.bare() as bare:
-            checked = _CheckedEnvironment(stack, bare, 0 if seed is None else seed, options)
+            checked = _CheckedEnvironment(stack, bare, self.reset_arguments)
             try:
                 check_exact(checked, stack.layers, self.action_space)
             finally:
-                checked.put_back(state)
+                checked.put_back((layers, nodes))
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Step the environment.
@@ -209,6 +212,11 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
         self.last_observation = private_copy(snapshot.last_observation)
         self.moment = (self.moment[0] + 1, 0)
 
+    @property
+    def simulators(self) -> list[Any]:
+        """The objects and layers of this environment that adapters capture."""
+        return self._stack.simulators
+
     def clone(self) -> "SnapshotEnvWrapper":
         """Make an independent copy of the environment in its present state.
 
@@ -220,7 +228,8 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
         """
         self.verify()
         copy = _clone(self._stack)
-        copy._spaces = self._spaces
+        copy._spaces, copy.verifies = self._spaces, self.verifies
+        copy.reset_arguments = self.reset_arguments
         copy.last_observation = private_copy(self.last_observation)
         return copy
 
@@ -248,17 +257,16 @@ class _CheckedEnvironment:
 
     :param stack: its layers.
     :param env: the outermost one that is stepped.
-    :param seed: of every reset.
-    :param options: of every reset.
+    :param reset_arguments: of every reset; without a seed, it is 0.
     :param copy: the wrapper around it, if it is a copy.
     """
 
     def __init__(
-        self, stack: Stack, env: Any, seed: int, options: Any, copy: SnapshotEnvWrapper | None = None
+        self, stack: Stack, env: Any, reset_arguments: dict[str, Any], copy: SnapshotEnvWrapper | None = None
     ) -> None:
         self._stack = stack
         self._env = env
-        self._reset_arguments = {"seed": seed, "options": options}
+        self._reset_arguments = reset_arguments
         self._copy = copy
 
     def capture(self) -> Any:
@@ -269,10 +277,11 @@ class _CheckedEnvironment:
 
     def copy(self) -> "_CheckedEnvironment":
         copy = self._named("making a clone of it", lambda: _clone(self._stack))
-        return _CheckedEnvironment(copy._stack, copy.env, **self._reset_arguments, copy=copy)
+        return _CheckedEnvironment(copy._stack, copy.env, self._reset_arguments, copy)
 
     def reset(self) -> None:
-        self._env.reset(**private_copy(self._reset_arguments))
+        arguments = private_copy(self._reset_arguments)
+        self._env.reset(seed=arguments["seed"] or 0, options=arguments["options"])
 
     def step(self, action: Any) -> Any:
         return self._env.step(action)
