@@ -385,6 +385,8 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         assert self.env is not None, "learn() needs an environment: call set_env()"
         if tb_log_name is None:
             tb_log_name = type(self).__name__
+        if self._searcher is not None:
+            self._searcher.go_on_here()
         with environment_named(self.env):
             return super().learn(
                 total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar

@@ -7,6 +7,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.preprocessing import maybe_transpose
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_mcbs.algorithms.learned_search import make_searcher
@@ -63,7 +64,7 @@ class SearchPolicy:
             self.settings = replace(model.search_settings, **search_settings)
         else:
             self.settings = SearchSettings(**with_preset(preset, search_settings))
-        self.vec_env = _as_vec_env(vec_env)
+        self.vec_env = _as_agents_vec_env(vec_env, model)
         self.rng = np.random.default_rng(seed)
         self.last_result: SearchResult | None = None
         # A copy, so that acting elsewhere does not change the training.
@@ -80,7 +81,7 @@ class SearchPolicy:
         """
         Search for the best actions in the present states of ``vec_env``.
 
-        :param observation: the present observations of ``vec_env``
+        :param observation: the present observations of ``vec_env``; images also with the channels last
         :param state: not used
         :param episode_start: not used
         :param deterministic: has no effect. The best candidate is always taken, without exploration noise;
@@ -89,7 +90,7 @@ class SearchPolicy:
         :return: the actions and ``state``
         """
         space = self.model.observation_space
-        batched, is_single = _add_batch_axis(observation, space)
+        batched, is_single = _add_batch_axis(_channels_first(observation, space), space)
         self.last_result = self.searcher.search(batched, self.rng)
         self.searcher.note_actions(self.last_result.actions)
         actions = self.searcher.unscale(self.last_result.actions)
@@ -114,6 +115,39 @@ def _as_vec_env(env: VecEnv | gym.Env) -> VecEnv:
         f"SearchPolicy plans from the states of a vectorized environment, got {type(env).__name__}. Pass "
         "make_vec_env(...), or a gym.Env wrapped in SnapshotEnvWrapper outermost, and act in the same object."
     )
+
+
+def _as_agents_vec_env(env: VecEnv | gym.Env, model: OffPolicyAlgorithm) -> VecEnv:
+    """Return an environment to act in as the agent sees it.
+
+    :raises ValueError: if its spaces are not the agent's.
+    """
+    vec_env = OffPolicyAlgorithm._wrap_env(_as_vec_env(env), monitor_wrapper=False)  # transposes images
+    spaces = (vec_env.observation_space, model.observation_space), (vec_env.action_space, model.action_space)
+    fits = _are_alike(*spaces[0]), spaces[1][0] == spaces[1][1]
+    for what, (ours, its), fit in zip(("observation", "action"), spaces, fits, strict=True):
+        if not fit:
+            raise ValueError(
+                f"The agent was trained with the {what} space {its}, and vec_env has {ours}. Make the "
+                "environment with the same id, arguments and wrappers as for the training."
+            )
+    return vec_env
+
+
+def _are_alike(one: gym.Space, other: gym.Space) -> bool:
+    """Whether observations of two spaces have the same entries; their bounds do not matter to an agent."""
+    if isinstance(one, gym.spaces.Dict) and isinstance(other, gym.spaces.Dict):
+        return one.spaces.keys() == other.spaces.keys() and all(_are_alike(one[k], other[k]) for k in one)
+    if isinstance(one, gym.spaces.Box) and isinstance(other, gym.spaces.Box):
+        return one.shape == other.shape
+    return one == other
+
+
+def _channels_first(observation: Any, space: gym.Space) -> Any:
+    """Transpose images as SB3's ``predict`` does."""
+    if isinstance(space, gym.spaces.Dict):
+        return {key: _channels_first(value, space[key]) for key, value in observation.items()}
+    return maybe_transpose(np.asarray(observation), space)
 
 
 def _add_batch_axis(observation: Any, space: gym.Space) -> tuple[Any, bool]:

@@ -1,6 +1,7 @@
 """Joins an agent's networks, the environments it acts in and a forward model to a search."""
 
 import logging
+import os
 import time
 import warnings
 from collections import defaultdict
@@ -22,7 +23,7 @@ from sb3_mcbs.algorithms.networks import (
     value_function,
 )
 from sb3_mcbs.algorithms.observations import difference, equal, n_rows, row_of
-from sb3_mcbs.algorithms.torch_settings import matmul_precision, one_thread
+from sb3_mcbs.algorithms.torch_settings import go_on_in_process, matmul_precision, one_thread
 from sb3_mcbs.algorithms.vec_env_view import (
     AgentView,
     VecEnvView,
@@ -101,6 +102,11 @@ class Searcher:
             if settings.strategy == "refine":
                 self._plans = PlanMemory(len(self._all_envs), settings.horizon, self._act_dim)
         self._functions = self._agent_functions()
+        self._process = os.getpid()
+
+    def go_on_here(self) -> None:
+        """Notice a fork of the process since this object was made."""
+        self._process = go_on_in_process(self._process)
 
     def _connect(self, vec_env: VecEnv, normalize_reward: bool | None) -> None:
         """Make the forward model, and the view of the environments."""
@@ -143,6 +149,7 @@ class Searcher:
         :raises NonFiniteError: if the networks, or the observations, are not finite.
         """
         start = time.perf_counter()
+        self.go_on_here()
         if self.agent.policy.training:
             self.agent.policy.set_training_mode(False)
         roots: list[Any] = []
@@ -223,14 +230,18 @@ class Searcher:
         """
         if self.model is None or not self.model.deterministic or result.first_step is None:
             return None
-        predicted = self.view.observe(result.first_step.observations)
+        view = self.view
+        assert isinstance(view, VecEnvView)
+        predicted = view.observe(result.first_step.observations)
         error = 0.0
         for row in np.flatnonzero(result.chosen >= 0).tolist():
             env = envs[row]
-            real = infos[env].get("terminal_observation")
-            if real is None:
-                real = row_of(observations, env)
-            error = max(error, difference(row_of(predicted, row), real))
+            last = infos[env].get("terminal_observation")
+            if last is None:
+                error = max(error, difference(row_of(predicted, row), row_of(observations, env)))
+            else:  # as the environment returned it, which the others no longer are
+                expected = view.observe_last(take_rows(result.first_step.observations, np.array([row])))
+                error = max(error, difference(row_of(expected, 0), view.as_kept(last)))
             # A vectorized environment hands rewards on as float32.
             error = max(
                 error, difference(np.float32(result.first_step.rewards[row]), np.float32(rewards[env]))

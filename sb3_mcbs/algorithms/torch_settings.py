@@ -2,13 +2,37 @@
 
 import ctypes
 import functools
+import logging
+import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import torch as th
 
+logger = logging.getLogger("sb3_mcbs")
+
 #: omp_pause_soft of the OpenMP 5.0 standard: free the threads, keep the settings.
 _OMP_PAUSE_SOFT = 1
+_PROCESS = os.getpid()
+
+
+def go_on_in_process(process: int) -> int:
+    """Have torch compute on one thread in a process that was forked after torch had started threads.
+
+    They do not survive the fork, and whoever waits for them waits for ever.
+
+    :param process: the id of the process that made what goes on here.
+    :return: the id of this one.
+    """
+    here = os.getpid()
+    if process != here and th.get_num_threads() > 1:
+        th.set_num_threads(1)
+        logger.warning(
+            "this agent was made before the process was forked, and torch's threads do not survive a fork: "
+            "torch computes on one thread here. Processes that are spawned have threads of their own "
+            "(multiprocessing's start method 'spawn' or 'forkserver')."
+        )
+    return here
 
 
 @contextmanager
@@ -23,7 +47,8 @@ def one_thread() -> Iterator[None]:
     if n_threads == 1:
         yield
         return
-    _openmp_pause()(_OMP_PAUSE_SOFT)
+    if os.getpid() == _PROCESS:  # after a fork there are no such threads, and waiting for them never ends
+        _openmp_pause()(_OMP_PAUSE_SOFT)
     th.set_num_threads(1)
     try:
         yield

@@ -137,7 +137,26 @@ class VecEnvView(AgentView):
         :param normalize: False leaves ``VecNormalize`` out, as replay buffers keep them.
         :return: ``[rows, *]`` as the networks expect them.
         """
-        observations = _as_space_dtype(observations, self.base.observation_space)
+        if isinstance(self.base, DummyVecEnv):  # it copies them into arrays of its own; workers send them
+            observations = _as_space_dtype(observations, self.base.observation_space)
+        return self._through_layers(observations, normalize)
+
+    def observe_last(self, observations: Observations) -> Observations:
+        """Pass the last observations of episodes through the wrappers, as ``infos`` have them.
+
+        :param observations: ``[rows, *obs_shape]`` as the environments return them.
+        :return: ``[rows, *]`` as replay buffers keep them.
+        """
+        return self.as_kept(self._through_layers(observations, normalize=True))
+
+    def as_kept(self, observations: Any) -> Observations:
+        """Round observations as replay buffers do.
+
+        :param observations: ``[rows, *]`` as the networks expect them, or one of them.
+        """
+        return _as_space_dtype(observations, self.vec_env.observation_space)
+
+    def _through_layers(self, observations: Observations, normalize: bool) -> Observations:
         for layer in self.layers:
             if isinstance(layer, VecNormalize):
                 if normalize:
@@ -212,11 +231,9 @@ def _has_return_statistics(normalizer: VecNormalize) -> bool:
     return float(normalizer.ret_rms.count) >= 1.0
 
 
-def _as_space_dtype(observations: Observations, space: spaces.Space) -> Observations:
+def _as_space_dtype(observations: Any, space: spaces.Space) -> Observations:
     if isinstance(space, spaces.Dict):
-        assert isinstance(observations, dict)
         return {
             key: np.asarray(value).astype(space[key].dtype, copy=False) for key, value in observations.items()
         }
-    assert isinstance(observations, np.ndarray)
-    return observations.astype(space.dtype, copy=False)
+    return np.asarray(observations).astype(space.dtype, copy=False)

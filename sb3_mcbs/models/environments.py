@@ -1,5 +1,6 @@
 """Where the real environments live, and how to run a function next to each of them."""
 
+import os
 import pickle
 import traceback
 from abc import ABC, abstractmethod
@@ -109,6 +110,7 @@ class WorkerEnvironments(Environments):
         self._check_available(inner)
         _check_wrapping(inner)
         self.vec_env = inner
+        self._process = os.getpid()
         self._overdue = _OVERDUE.setdefault(inner, [])
         collect_tracebacks(inner)
 
@@ -119,6 +121,11 @@ class WorkerEnvironments(Environments):
         self, env_indices: Sequence[int], function: Callable[..., Any], args_per_env: Sequence[Sequence[Any]]
     ) -> list[Any]:
         self._check_available(self.vec_env)
+        if self._process != os.getpid():
+            raise ForwardModelError(
+                "the workers of this SubprocVecEnv belong to the process that this one was forked from: make "
+                "new environments here, and give them to the agent with set_env()"
+            )
         while self._overdue:
             overdue, its_args = self._overdue.pop()
             self._call(range(len(self)), overdue, [its_args] * len(self))

@@ -1,6 +1,7 @@
 """The forward model for known MuJoCo environments: physics on threads, the rest as array code."""
 
 import math
+import os
 from collections.abc import Sequence
 from typing import Any
 
@@ -25,6 +26,9 @@ from sb3_mcbs.models.recognition import (
 from sb3_mcbs.models.workers import WorkerError
 
 _FIRST_CAPACITY = 32
+
+# Engines that a forked process got from its parent. Letting go of one waits for threads that are not there.
+_OF_THE_PARENT: list[Engine] = []
 
 
 class NotRecognizedError(ForwardModelError):
@@ -116,13 +120,13 @@ class MujocoBatchModel(ForwardModel):
     def _build(self, capacity: int) -> None:
         """Make an engine for at least ``capacity`` rows, with empty rows."""
         names = tuple(dict.fromkeys(("ctrl", *self._fields.before, *self._fields.after)))
-        if self._engine is not None:
-            self._engine.close()
+        self.close()
         try:
             self._engine = make_engine(self._constants.model, capacity, names, self._n_threads)
         except ValueError as error:
             raise ForwardModelError(f"the batch cannot simulate this model: {error}") from error
         self._constants.model = self._engine.model
+        self._process = os.getpid()
         self._capacity = capacity
         self._arrays = {name: self._engine.field(name) for name in names}
         self._before = {
@@ -151,6 +155,8 @@ class MujocoBatchModel(ForwardModel):
 
     def set_roots(self, roots: Sequence[Any], index: np.ndarray, rng: np.random.Generator) -> None:
         table = np.stack(roots)[index]
+        if self._process != os.getpid():
+            self._build(self._capacity)  # threads do not survive a fork
         if table.shape[1] != self._state_size + sum(self._before[name][0].size for name in self._lagging):
             raise ValueError("these roots were read by another model")
         rows = len(table)
@@ -258,8 +264,12 @@ class MujocoBatchModel(ForwardModel):
                 )
 
     def close(self) -> None:
-        if self._engine is not None:
+        if self._engine is None:
+            return
+        if self._process == os.getpid():
             self._engine.close()
+        else:
+            _OF_THE_PARENT.append(self._engine)
 
 
 def _difference(first: KnownEnvironment, other: KnownEnvironment) -> str:
