@@ -21,6 +21,8 @@ WATCHED = ("rl_zoo3.utils", "rl_zoo3.hyperparams_opt", "rl_zoo3.exp_manager", "s
 # Commands that name the off-policy algorithms within their code. ``python -m`` runs that code and imports
 # nothing, so it is changed on the way.
 COMMANDS = ("rl_zoo3.enjoy", "rl_zoo3.record_video", "rl_zoo3.push_to_hub")
+# The system's library that MuJoCo draws pictures with, by the value of MUJOCO_GL.
+LIBRARIES = {"osmesa": "libosmesa6", "egl": "libegl1"}
 
 
 def _register(module: "Any") -> None:
@@ -33,6 +35,8 @@ def _register(module: "Any") -> None:
 
 
 def _extend(name: str, code: "Any") -> "Any":
+    if name == "rl_zoo3.record_video":
+        sys.excepthook = name_missing_library
     try:
         from sb3_mcbs.zoo import registration
 
@@ -45,12 +49,52 @@ def _extend(name: str, code: "Any") -> "Any":
 def _warn(name: str, error: Exception) -> None:
     import warnings
 
+    cause = f"{type(error).__name__}: {error}"
+    failure = f"sb3-mcbs could not register its algorithms when {name} was imported ({cause})"
+    backend = os.environ.get("MUJOCO_GL", "").strip().lower()
+    # With a renderer that is not there, not even MuJoCo itself can be imported.
+    if backend in LIBRARIES and "mujoco" not in sys.modules:
+        advice = (
+            f"MUJOCO_GL={backend} needs the system library {LIBRARIES[backend]}: install it, or unset "
+            "MUJOCO_GL to do without pictures"
+        )
+    else:
+        advice = "Repair the installation (pip install --force-reinstall sb3-mcbs)"
+    if _is_asked_for():
+        raise SystemExit(f"{failure}. {advice}.")
     warnings.warn(
-        f"sb3-mcbs could not register its algorithms when {name} was imported "
-        f"({type(error).__name__}: {error}). RL Zoo's own algorithms are not affected. Repair the "
-        f"installation (pip install --force-reinstall sb3-mcbs), or set {SWITCH}=1 to silence this.",
+        f"{failure}. RL Zoo's own algorithms are not affected. {advice}, or set {SWITCH}=1 to silence this.",
         RuntimeWarning,
         stacklevel=3,
+    )
+
+
+def _is_asked_for() -> bool:
+    """Whether the command line names one of our algorithms, which RL Zoo would call an invalid choice."""
+    return "--algo mcbs_" in " ".join(getattr(sys, "argv", ())).replace("--algo=", "--algo ")
+
+
+def name_missing_library(kind: "Any", error: BaseException, traceback: "Any") -> None:
+    """
+    Show an uncaught error; in place of a traceback through MuJoCo's renderer say what it needs.
+
+    :param kind: class of the error
+    :param error: the error
+    :param traceback: where it came from
+    """
+    modules, step = [], traceback
+    while step is not None:
+        modules.append(step.tb_frame.f_globals.get("__name__"))
+        step = step.tb_next
+    if "gymnasium.envs.mujoco.mujoco_rendering" not in modules or not isinstance(error, Exception):
+        sys.__excepthook__(kind, error, traceback)
+        return
+    backend = os.environ.get("MUJOCO_GL") or "unset"
+    print(
+        f"MuJoCo cannot draw pictures here ({kind.__name__}: {error}). MUJOCO_GL is {backend}. Without a "
+        "display install the system library libosmesa6 and set MUJOCO_GL=osmesa, or libegl1 and "
+        "MUJOCO_GL=egl.",
+        file=sys.stderr,
     )
 
 

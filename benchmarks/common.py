@@ -1,5 +1,6 @@
 """What the benchmarks share: the machine in words, fair timing, tables and files."""
 
+import argparse
 import json
 import os
 import platform
@@ -11,7 +12,10 @@ from typing import Any
 
 import numpy as np
 
-RESULTS = Path(__file__).parent / "results"
+#: The results in the repository.
+COMMITTED = Path(__file__).parent / "results"
+#: Where results go unless the command line says otherwise; git ignores it.
+DEFAULT_OUTPUT = Path("benchmark-results")
 NETWORKS = {"net_arch": [400, 300]}
 
 
@@ -68,7 +72,7 @@ def print_table(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
     """Print a Markdown table.
 
     :param header: names of the columns.
-    :param rows: floats are shown with three significant digits.
+    :param rows: floats are shown with three significant digits, ``None`` as a dash.
     """
     print("| " + " | ".join(header) + " |")
     print("|" + "---|" * len(header))
@@ -77,18 +81,62 @@ def print_table(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
 
 
 def _shown(value: Any) -> str:
+    if value is None:
+        return "-"
     if not isinstance(value, float):
         return str(value)
     return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
+
+
+#: Where this process writes; set by :func:`parse_args`.
+output_folder = DEFAULT_OUTPUT
+
+
+def parse_args(parser: argparse.ArgumentParser) -> argparse.Namespace:
+    """Read the command line of a benchmark that writes results, with ``--output`` besides its own options.
+
+    :param parser: with the benchmark's own options.
+    :return: the values of those.
+    """
+    global output_folder
+    parser.add_argument(
+        "--output",
+        type=Path,
+        default=DEFAULT_OUTPUT,
+        metavar="FOLDER",
+        help=f"write here (default: {DEFAULT_OUTPUT}); benchmarks/results replaces the committed results",
+    )
+    args = parser.parse_args()
+    output_folder = args.output
+    del args.output  # some benchmarks write their own options into the results
+    return args
+
+
+def output_path(name: str) -> Path:
+    """Where a result is written; its folder is made.
+
+    :param name: of the file.
+    """
+    output_folder.mkdir(parents=True, exist_ok=True)
+    return output_folder / name
+
+
+def known_path(name: str) -> Path:
+    """The file of results that a benchmark goes on from: what it wrote before, else what is committed.
+
+    :param name: of the file, without its ending.
+    """
+    path = output_folder / f"{name}.json"
+    return path if path.exists() else COMMITTED / path.name
 
 
 def read(name: str) -> list[dict[str, Any]]:
     """Read rows that :func:`write` wrote.
 
     :param name: of the file, without its ending.
-    :return: the rows; none if there is no such file.
+    :return: the rows of :func:`known_path`; none if there is no such file.
     """
-    path = RESULTS / f"{name}.json"
+    path = known_path(name)
     return json.loads(path.read_text())["results"] if path.exists() else []
 
 
@@ -99,8 +147,19 @@ def write(name: str, results: Any) -> Path:
     :param results: whatever JSON can hold.
     :return: the file.
     """
-    RESULTS.mkdir(exist_ok=True)
-    path = RESULTS / f"{name}.json"
+    path = output_path(f"{name}.json")
     path.write_text(json.dumps({"machine": machine(), "results": results}, indent=1) + "\n")
     print(f"Written: {path}")
     return path
+
+
+def write_picture(figure: Any, name: str, dpi: int = 120) -> None:
+    """Write a picture beside the results.
+
+    :param figure: of matplotlib.
+    :param name: of the file.
+    :param dpi: pixels per inch.
+    """
+    path = output_path(name)
+    figure.savefig(path, dpi=dpi)
+    print(f"Written: {path}")

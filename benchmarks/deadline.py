@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.env_util import make_vec_env
 
-from benchmarks.common import NETWORKS, machine, print_table, write
+from benchmarks.common import NETWORKS, machine, parse_args, print_table, write
 from sb3_mcbs import MCBSTD3, SearchPolicy
 
 
@@ -52,7 +52,7 @@ def main() -> None:
     parser.add_argument("--env", default="Walker2d-v5")
     parser.add_argument("--ms", type=float, nargs="+", default=[2, 5, 20])
     parser.add_argument("--decisions", type=int, default=1000)
-    args = parser.parse_args()
+    args = parse_args(parser)
     print(machine())
     results = [measure(args.env, ms / 1e3, args.decisions) for ms in args.ms]
     print_table(list(results[0]), [list(result.values()) for result in results])

@@ -1,4 +1,7 @@
-"""What a look-ahead costs on each forward model: ``python benchmarks/forward_models.py``."""
+"""What a look-ahead costs on each forward model: ``python benchmarks/forward_models.py``.
+
+Environments that the batch does not know are simulated by the pool alone.
+"""
 
 import argparse
 import time
@@ -9,7 +12,7 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_mcbs import SnapshotEnvWrapper
-from sb3_mcbs.models import LocalEnvironments, make_forward_model
+from sb3_mcbs.models import ForwardModelError, LocalEnvironments, make_forward_model
 
 COLUMNS = ("read root", "set roots", "copy rows", "step", "per row", "env.step")
 
@@ -25,13 +28,16 @@ def quickest(call: Callable[[], Any], repetitions: int) -> float:
 
 
 def measure(env_id: str, kind: str, rows: int, n_threads: int, repetitions: int) -> list[float]:
-    """Microseconds for each of :data:`COLUMNS`."""
+    """Microseconds for each of :data:`COLUMNS`.
+
+    :raises ForwardModelError: if this kind of model cannot simulate the environment.
+    """
     env = SnapshotEnvWrapper(gym.make(env_id))
     env.reset(seed=0)
     model = make_forward_model(LocalEnvironments([env]), kind, n_threads)
     rng = np.random.default_rng(0)
-    space: Any = env.action_space
-    actions = rng.uniform(space.low, space.high, (rows, *space.shape)).astype(space.dtype)
+    env.action_space.seed(0)
+    actions = np.stack([env.action_space.sample() for _ in range(rows)])
     root, index = model.read_roots([0]), np.zeros(rows, dtype=int)
     half = np.repeat(np.arange(rows // 2), 2)
 
@@ -64,11 +70,16 @@ def main() -> None:
     parser.add_argument("--n-threads", type=int, default=0)
     parser.add_argument("--repetitions", type=int, default=100)
     args = parser.parse_args()
-    print(f"{args.rows} rows, microseconds" + "".join(f"{name:>11}" for name in COLUMNS))
+    title = f"{args.rows} rows, microseconds"
+    print(f"{title:<34}" + "".join(f"{name:>11}" for name in COLUMNS))
     for env_id in args.env:
         for kind in ("mujoco", "pool"):
-            values = measure(env_id, kind, args.rows, args.n_threads, args.repetitions)
-            print(f"{env_id:<16}{kind:<6}" + "".join(f"{value:11.1f}" for value in values))
+            try:
+                values = measure(env_id, kind, args.rows, args.n_threads, args.repetitions)
+                cells = "".join(f"{value:11.1f}" for value in values)
+            except ForwardModelError as reason:
+                cells = f" cannot: {reason}"
+            print(f"{env_id:<26}{kind:<8}{cells}", flush=True)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ import numpy as np
 import torch as th
 from stable_baselines3 import TD3
 
-from benchmarks.common import alternate, machine, print_table, timed, write
+from benchmarks.common import alternate, machine, parse_args, print_table, timed, write
 from sb3_mcbs.algorithms.td3_update import TD3Update
 
 NETWORKS = ([32, 32], [64, 64], [256, 256], [400, 300], [512, 512, 512])
@@ -59,7 +59,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--seconds", type=float, default=1.5, help="for each size")
-    args = parser.parse_args()
+    args = parse_args(parser)
     print(machine())
     results = []
     for n_threads in args.threads:

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.common import print_table, read, write
+from benchmarks.common import parse_args, print_table, read, write
 from benchmarks.kill_run import ALGORITHMS, CASES, RESULT, STARTED
 
 STEPS = {"HalfCheetah-v5": 4000, "Ant-v5": 3000, "Walker2d-v5": 6000, "Pendulum-v1": 5000}
@@ -152,7 +152,7 @@ def main() -> None:
     parser.add_argument("--save-freq", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--folder", type=Path, help="keep the runs here")
-    arguments = parser.parse_args()
+    arguments = parse_args(parser)
     folder = arguments.folder or Path(tempfile.mkdtemp(prefix="sb3-mcbs-kill-"))
     rows = []
     for algorithm, case in itertools.product(arguments.algorithms, arguments.cases):

@@ -5,7 +5,7 @@
 Arms differ in nothing but what simulates while they train: "none" (TD3), "exact" (a copy of the simulator),
 "learned" (an ensemble). Every agent is evaluated on the same resets as the bare actor, and with the same
 search ("efficient": 18 simulated steps per decision) by each model that it has. For the learned model the
-error of predictions over several steps is measured too. The result is written to ``benchmarks/results``.
+error of predictions over several steps is measured too.
 """
 
 import argparse
@@ -19,7 +19,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.noise import NormalActionNoise
 
-from benchmarks.common import NETWORKS, write
+from benchmarks.common import NETWORKS, parse_args, write
 from benchmarks.search_training_arms import PlainTD3
 from sb3_mcbs import MCBSTD3, SearchPolicy, SnapshotEnvWrapper
 from sb3_mcbs.models import EnsembleModel
@@ -143,7 +143,7 @@ def main() -> None:
     parser.add_argument("--learning-starts", type=int, default=10_000)
     parser.add_argument("--max-error", type=float, default=0.5)
     parser.add_argument("--pessimism", type=float, default=1.0)
-    args = parser.parse_args()
+    args = parse_args(parser)
     th.set_num_threads(1)
     agent = make_agent(args)
     start = time.process_time()

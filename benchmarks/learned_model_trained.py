@@ -16,7 +16,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.env_util import make_vec_env
 
-from benchmarks.common import write
+from benchmarks.common import parse_args, write
 from benchmarks.learned_model import error_over_horizon, evaluate
 from benchmarks.trained_agent import ALGOS, load_agent
 from sb3_mcbs.algorithms.learned_model import HELD_OUT_EVERY, EnsembleSettings, LearnedModel
@@ -55,7 +55,7 @@ def main() -> None:
     parser.add_argument("--noise", type=float, default=0.2)
     parser.add_argument("--gradient-steps", type=int, default=2500)
     parser.add_argument("--exact", default="auto", help="forward_model that is exact; empty: there is none")
-    args = parser.parse_args()
+    args = parse_args(parser)
     th.set_num_threads(1)
     agent: Any = load_agent(args.path, args.algo, make_vec_env(args.env, 1))
     agent.learned_model = LearnedModel(agent, EnsembleSettings())

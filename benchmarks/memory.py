@@ -13,7 +13,7 @@ import matplotlib
 import numpy as np
 from matplotlib import pyplot
 
-from benchmarks.common import RESULTS, machine, print_table, write
+from benchmarks.common import machine, parse_args, print_table, write, write_picture
 from sb3_mcbs import MCBSTD3
 
 SIZE: dict[str, Any] = {"beam_width": 6, "rollout_depth": 3, "n_simulations": 5}
@@ -75,7 +75,7 @@ def main() -> None:
     parser.add_argument("--env", default="HalfCheetah-v5")
     parser.add_argument("--decisions", type=int, default=100_000)
     parser.add_argument("--steps", type=int, default=20_000)
-    args = parser.parse_args()
+    args = parse_args(parser)
     matplotlib.use("agg")
     print(machine())
     agent = make_agent(args.env)
@@ -95,7 +95,7 @@ def main() -> None:
     header = ["over", "number", "first MB", "last MB", "growth MB", "most MB above first"]
     print_table(header, rows)
     write("memory", [dict(zip(header, row, strict=True)) for row in rows])
-    figure.savefig(RESULTS / "memory.png", dpi=120)
+    write_picture(figure, "memory.png")
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.noise import NormalActionNoise
 
-from benchmarks.common import print_table, read, write
+from benchmarks.common import parse_args, print_table, read, write
 from sb3_mcbs import MCBSTD3, SearchPolicy, SnapshotEnvWrapper
 from sb3_mcbs.search import PRESETS
 
@@ -82,7 +82,7 @@ def main() -> None:
     )
     parser.add_argument("env", choices=LENGTHS)
     parser.add_argument("--seeds", type=int, nargs="+", default=list(range(5)))
-    args = parser.parse_args()
+    args = parse_args(parser)
     th.set_num_threads(1)
     file, (steps, _) = f"saturation-{args.env}", LENGTHS[args.env]
     rows = [row for row in read(file) if row["environment steps"] == steps]

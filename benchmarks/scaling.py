@@ -13,7 +13,16 @@ import numpy as np
 from matplotlib import pyplot
 from stable_baselines3.common.env_util import make_vec_env
 
-from benchmarks.common import NETWORKS, RESULTS, alternate, machine, print_table, timed, write
+from benchmarks.common import (
+    NETWORKS,
+    alternate,
+    machine,
+    parse_args,
+    print_table,
+    timed,
+    write,
+    write_picture,
+)
 from sb3_mcbs import MCBSTD3
 
 VARIED: dict[str, tuple[int, ...]] = {
@@ -84,7 +93,7 @@ def draw(env_id: str, results: list[dict[str, Any]]) -> None:
     all_axes[0, 0].set_ylabel("ms per decision")
     figure.suptitle(f"{env_id}, varied around (6, 3, 5)", fontsize=10)
     figure.tight_layout()
-    figure.savefig(RESULTS / "scaling.png", dpi=120)
+    write_picture(figure, "scaling.png")
 
 
 def main() -> None:
@@ -92,7 +101,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--env", default="HalfCheetah-v5")
     parser.add_argument("--seconds", type=float, default=12, help="for each setting")
-    args = parser.parse_args()
+    args = parse_args(parser)
     matplotlib.use("agg")
     print(machine())
     results: list[dict[str, Any]] = []

@@ -2,7 +2,8 @@
 
 A decision is held against the floor of its own physics (its states and controls replayed through
 ``mujoco.batch``, nothing else), the floor of its own networks (the same matrix products with the
-same weights through ``torch.mm``, nothing else), and the usual way of searching (``naive.py``).
+same weights through ``torch.mm``, nothing else), and the usual way of searching (``naive.py``). The first
+is for environments that the batch simulates, the last for those of MuJoCo: elsewhere the table has a dash.
 """
 
 import argparse
@@ -14,12 +15,23 @@ import matplotlib
 import mujoco
 import numpy as np
 import torch as th
+from gymnasium.envs.mujoco import MujocoEnv
 from matplotlib import pyplot
 from mujoco.batch import Batch
 
-from benchmarks.common import NETWORKS, RESULTS, alternate, machine, print_table, timed, write
+from benchmarks.common import (
+    NETWORKS,
+    alternate,
+    machine,
+    parse_args,
+    print_table,
+    timed,
+    write,
+    write_picture,
+)
 from benchmarks.naive import usual_search
 from sb3_mcbs import MCBSTD3
+from sb3_mcbs.search import SearchResult
 
 ENVS = ("HalfCheetah-v5", "Walker2d-v5", "Swimmer-v5", "Ant-v5", "Humanoid-v5")
 SIZES = ((6, 1, 5), (6, 3, 5), (18, 6, 5), (18, 9, 10))
@@ -58,10 +70,15 @@ class Decision:
         self.rng = np.random.default_rng(0)
         self._record()
 
-    def search(self) -> None:
+    @property
+    def is_batched(self) -> bool:
+        """Whether the physics is the batch's, so that it has a floor."""
+        return hasattr(self.model, "_engine")
+
+    def search(self) -> SearchResult:
         """One decision from the present state, which stays as it is."""
         observations: Any = self.agent._last_obs
-        self.searcher.search(observations, self.rng)
+        return self.searcher.search(observations, self.rng)
 
     def search_the_usual_way(self) -> None:
         """The same by :mod:`naive`."""
@@ -69,16 +86,12 @@ class Decision:
         usual_search(self.agent, self.real, self.simulator, observations[0], self.size, 0.1, self.rng)
 
     def _record(self) -> None:
-        """Note the states before every physics step, and the rows of every network call."""
-        self.search()  # so that the engine has its size
-        engine: Any = self.model._engine  # type: ignore[union-attr]
-        functions, step = self.searcher._functions, engine.step
-        self.states: list[np.ndarray] = []
+        """Note the rows of every network call, and the states before every step of the batch."""
+        self.simulated_steps = self.search().simulated_steps
+        if self.is_batched:  # its engine has its size now
+            self._record_physics()
+        functions = self.searcher._functions
         policy_rows, value_rows = [], []
-
-        def noted_step(rows: int, n_substeps: int) -> Any:
-            self.states.append(engine.state[:rows].copy())
-            return step(rows, n_substeps)
 
         def noted_policy(observations: Any) -> np.ndarray:
             policy_rows.append(len(observations))
@@ -88,17 +101,9 @@ class Decision:
             value_rows.append(len(observations))
             return functions.value(observations, actions)
 
-        engine.step = noted_step
         self.searcher._functions = functions._replace(policy=noted_policy, value=noted_value)
         self.search()
-        engine.step = step
         self.searcher._functions = functions
-
-        self.simulated_steps = sum(len(states) for states in self.states)
-        self.n_substeps = self.real.frame_skip
-        most = max(len(states) for states in self.states)
-        self.batch = Batch(self.real.model, most, 0)
-        self.ids = np.arange(most, dtype=np.int32)
         critics: list[Any] = self.agent.critic.q_networks
         calls = [(self.agent.actor.mu, n) for n in policy_rows]
         calls += [(critic, n) for n in value_rows for critic in critics]
@@ -111,6 +116,25 @@ class Decision:
             [(th.randn(n, w.shape[1]), w.t(), th.empty(n, w.shape[0])) for w, n in weights],
             [(w, th.randn(w.shape[1], n), th.empty(w.shape[0], n)) for w, n in weights],
         )
+
+    def _record_physics(self) -> None:
+        """Note the states before every step of the batch."""
+        engine: Any = self.model._engine  # type: ignore[union-attr]
+        step = engine.step
+        self.states: list[np.ndarray] = []
+
+        def noted_step(rows: int, n_substeps: int) -> Any:
+            self.states.append(engine.state[:rows].copy())
+            return step(rows, n_substeps)
+
+        engine.step = noted_step
+        self.search()
+        engine.step = step
+        self.simulated_steps = sum(len(states) for states in self.states)
+        self.n_substeps = self.real.frame_skip
+        most = max(len(states) for states in self.states)
+        self.batch = Batch(self.real.model, most, 0)
+        self.ids = np.arange(most, dtype=np.int32)
 
     def physics_floor(self) -> float:
         """Seconds that the batch alone needs for the decision's steps."""
@@ -140,7 +164,7 @@ class Decision:
 
 
 def measure(env_id: str, size: tuple[int, int, int], seconds: float) -> dict[str, Any]:
-    """All figures of one environment and size, times in milliseconds.
+    """All figures of one environment and size, times in milliseconds; ``None`` where one has no meaning.
 
     :param env_id: the environment.
     :param size: beam width, rollout depth, simulations per candidate.
@@ -148,37 +172,54 @@ def measure(env_id: str, size: tuple[int, int, int], seconds: float) -> dict[str
     """
     decision = Decision(env_id, size)
     calls = {
-        "physics": decision.physics_floor,
         "networks by rows": lambda: decision.network_floor(0),
         "networks by columns": lambda: decision.network_floor(1),
         "search": timed(decision.search),
     }
+    if decision.is_batched:
+        calls = {"physics": decision.physics_floor, **calls}
     times = alternate(calls, seconds, least=15)
-    pair = {"usual": timed(decision.search_the_usual_way), "ours": timed(decision.search)}
-    versus = alternate(pair, seconds / 2, least=3)
-    usual = versus["usual"]
+    rows, columns = times["networks by rows"], times["networks by columns"]
+    usual = versus_usual(decision, seconds / 2)
     training = alternate({"search": decision.search_after_gradient_step}, seconds, least=15)["search"]
-    median = {name: 1e3 * float(np.median(values)) for name, values in times.items()}
-    physics, networks = median["physics"], min(median["networks by rows"], median["networks by columns"])
-    # Of each round by itself, then the median: the machine's speed drifts less within a round.
-    floors = times["physics"] + np.minimum(times["networks by rows"], times["networks by columns"])
-    control_period = 1e3 * decision.real.dt
+    ms = _milliseconds(times["search"])
+    control_period = 1e3 * decision.real.dt if hasattr(decision.real, "dt") else None
     return {
         "env": env_id,
         "size": size,
         "rounds": len(times["search"]),
         "simulated steps": decision.simulated_steps,
-        "ms": median["search"],
+        "ms": ms,
         "p99 ms": 1e3 * float(np.percentile(times["search"], 99)),
-        "physics floor ms": physics,
-        "network floor ms": networks,
-        "ms / floors": float(np.median(times["search"] / floors)),
-        "usual way ms": 1e3 * float(np.median(usual)),
-        "usual way / ours": float(np.median(usual / versus["ours"])),
+        "physics floor ms": _milliseconds(times["physics"]) if decision.is_batched else None,
+        "network floor ms": min(_milliseconds(rows), _milliseconds(columns)),
+        # Of each round by itself, then the median: the machine's speed drifts less within a round.
+        "ms / floors": float(np.median(times["search"] / (times["physics"] + np.minimum(rows, columns))))
+        if decision.is_batched
+        else None,
+        **usual,
         "control period ms": control_period,
-        "share of period": median["search"] / control_period,
+        "share of period": None if control_period is None else ms / control_period,
         "p99 ms while training": 1e3 * float(np.percentile(training, 99)),
     }
+
+
+def _milliseconds(times: np.ndarray) -> float:
+    return 1e3 * float(np.median(times))
+
+
+def versus_usual(decision: Decision, seconds: float) -> dict[str, float | None]:
+    """The usual way of searching, and how many times as long it takes; ``None`` without MuJoCo.
+
+    :param decision: what is decided.
+    :param seconds: how long to measure.
+    """
+    if not isinstance(decision.real, MujocoEnv):
+        return {"usual way ms": None, "usual way / ours": None}
+    pair = {"usual": timed(decision.search_the_usual_way), "ours": timed(decision.search)}
+    times = alternate(pair, seconds, least=3)
+    ratio = float(np.median(times["usual"] / times["ours"]))
+    return {"usual way ms": _milliseconds(times["usual"]), "usual way / ours": ratio}
 
 
 def draw(results: list[dict[str, Any]]) -> None:
@@ -188,19 +229,23 @@ def draw(results: list[dict[str, Any]]) -> None:
     for axes, env_id in zip(all_axes[0], envs, strict=True):
         shown = [r for r in results if r["env"] == env_id]
         places = np.arange(len(shown))
-        floors = [r["physics floor ms"] + r["network floor ms"] for r in shown]
-        axes.bar(places - 0.27, floors, 0.25, label="physics + network floor", color="lightgrey")
-        axes.bar(places, [r["ms"] for r in shown], 0.25, label="sb3-mcbs")
-        axes.bar(places + 0.27, [r["usual way ms"] for r in shown], 0.25, label="the usual way")
-        period = shown[0]["control period ms"]
-        axes.axhline(period, linestyle=":", color="black", label="control period")
+        if shown[0]["physics floor ms"] is not None:
+            floors = [r["physics floor ms"] + r["network floor ms"] for r in shown]
+            axes.bar(places - 0.27, floors, 0.25, label="physics + network floor", color="lightgrey")
+        axes.bar(places, [r["ms"] for r in shown], 0.25, label="sb3-mcbs", color="C0")
+        if shown[0]["usual way ms"] is not None:
+            usual = [r["usual way ms"] for r in shown]
+            axes.bar(places + 0.27, usual, 0.25, label="the usual way", color="C1")
+        if shown[0]["control period ms"] is not None:
+            period = shown[0]["control period ms"]
+            axes.axhline(period, linestyle=":", color="black", label="control period")
         axes.set_yscale("log")
         axes.set_title(env_id, fontsize=9)
         axes.set_xticks(places, [",".join(map(str, r["size"])) for r in shown], fontsize=7)
     all_axes[0, 0].set_ylabel("ms per decision")
     all_axes[0, 0].legend(fontsize=7)
     figure.tight_layout()
-    figure.savefig(RESULTS / "search.png", dpi=120)
+    write_picture(figure, "search.png")
 
 
 def main() -> None:
@@ -209,7 +254,7 @@ def main() -> None:
     parser.add_argument("--env", nargs="+", default=ENVS)
     parser.add_argument("--size", nargs="+", default=[",".join(map(str, size)) for size in SIZES])
     parser.add_argument("--seconds", type=float, default=4, help="for each environment and size")
-    args = parser.parse_args()
+    args = parse_args(parser)
     matplotlib.use("agg")
     print(machine())
     results = []

@@ -2,8 +2,8 @@
 
     python -m benchmarks.search_training_report
 
-Runs in the folder are added to ``benchmarks/results/search_training.json``, which holds one run of every
-environment, arm and seed; all of that file is reported.
+Runs in the folder are added to those in ``benchmarks/results/search_training.json``, one of every
+environment, arm and seed; all of them are reported, and written where ``--output`` says.
 """
 
 import argparse
@@ -15,9 +15,10 @@ import matplotlib
 import numpy as np
 from scipy.stats import trim_mean
 
-from benchmarks.common import RESULTS, print_table
+from benchmarks.common import known_path, output_path, parse_args, print_table, write_picture
 from benchmarks.search_training_arms import ARMS
 
+FILE = "search_training"
 POLICIES = {"actor": "actor alone", "search": "actor with search"}
 #: Evaluations in this last part of a run are averaged.
 LAST_PART = 0.25
@@ -44,19 +45,20 @@ def interquartile_mean(values: list[float]) -> float:
     return float(trim_mean(values, 0.25))
 
 
-def add_runs(folder: Path, path: Path) -> list[Run]:
-    """Add the finished runs of a folder to those of the results file.
+def add_runs(folder: Path) -> list[Run]:
+    """Add the finished runs of a folder to those that are known, and write them all.
 
     :param folder: of ``benchmarks.search_training``.
-    :param path: the results file; written.
     :return: all of them, by environment, arm and seed.
     """
-    known = json.loads(path.read_text()) if path.exists() else []
+    known = json.loads(known_path(FILE).read_text())
     found = [json.loads(file.read_text()) for file in sorted(folder.glob("*.json"))]
     finished = [run for run in found if run["evaluations"][-1]["step"] >= run["steps"]]
     runs = {(run["env"], list(ARMS).index(run["arm"]), run["seed"]): run for run in known + finished}
     ordered = [runs[key] for key in sorted(runs)]
+    path = output_path(f"{FILE}.json")
     path.write_text("[\n" + ",\n".join(json.dumps(run) for run in ordered) + "\n]\n")
+    print(f"Written: {path}, with {len(finished)} runs of {folder}")
     return ordered
 
 
@@ -88,13 +90,12 @@ def _mean(evaluations: list[dict[str, Any]], name: str, unit: float, form: str) 
     return f"{np.mean(known) / unit:{form}}" if known else "?"
 
 
-def draw(env_id: str, runs: list[Run], arms: list[str], path: Path) -> None:
+def draw(env_id: str, runs: list[Run], arms: list[str]) -> None:
     """Draw the learning curves of some arms, both policies beside one another.
 
     :param env_id: the environment.
     :param runs: those in it.
     :param arms: which to draw.
-    :param path: the picture; written.
     """
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
@@ -114,8 +115,7 @@ def draw(env_id: str, runs: list[Run], arms: list[str], path: Path) -> None:
     both_axes[0].set_ylabel("return (thick: interquartile mean)")
     both_axes[0].legend(loc="upper left")
     figure.tight_layout()
-    figure.savefig(path, dpi=100)
-    print(f"Written: {path}")
+    write_picture(figure, f"search_training-{env_id}.png", dpi=100)
 
 
 def main() -> None:
@@ -124,14 +124,14 @@ def main() -> None:
     )
     parser.add_argument("--folder", type=Path, default=Path("logs/search_training"))
     parser.add_argument("--draw", nargs="+", choices=ARMS, default=["td3", "algorithm1"])
-    args = parser.parse_args()
-    runs = add_runs(args.folder, RESULTS / "search_training.json")
+    args = parse_args(parser)
+    runs = add_runs(args.folder)
     for env_id in dict.fromkeys(run["env"] for run in runs):
         mine = [run for run in runs if run["env"] == env_id]
         print_environment(env_id, mine)
         drawn = [arm for arm in args.draw if any(run["arm"] == arm for run in mine)]
         if drawn:
-            draw(env_id, mine, drawn, RESULTS / f"search_training-{env_id}.png")
+            draw(env_id, mine, drawn)
 
 
 if __name__ == "__main__":

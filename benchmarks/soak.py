@@ -18,7 +18,7 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
-from benchmarks.common import NETWORKS, RESULTS, print_table, write
+from benchmarks.common import NETWORKS, parse_args, print_table, write, write_picture
 from sb3_mcbs import MCBSTD3, ExactCheckpointCallback, SnapshotEnvWrapper
 
 N_ENVS = 4
@@ -142,13 +142,13 @@ def draw(samples: list[dict[str, Any]]) -> None:
     axes.set_ylabel("growth of resident memory (MB)")
     axes.legend()
     figure.tight_layout()
-    figure.savefig(RESULTS / "soak.png", dpi=110)
+    write_picture(figure, "soak.png", dpi=110)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=60)
-    arguments = parser.parse_args()
+    arguments = parse_args(parser)
     th.set_num_threads(1)
     with tempfile.TemporaryDirectory(prefix="sb3-mcbs-soak-") as folder:
         samples = soak(Path(folder), arguments.minutes * 60, 30)

@@ -11,8 +11,8 @@ seeds and reported on another:
 The second runs what was best of each strategy and budget in the first, and the presets. Arms are named by
 their sizes: beam candidates x depth, tree width x branching x depth, refine width x rounds x depth; (2x3) is
 a depth of 2 macro-steps of 3 steps, "in 2" two directions, "of 48" critic pre-selection, "soft"
-entropy_bonus, "truncated" tqc_value. Arms that the file of results holds already are left out. The third runs
-a hundred episodes, for agents that fall in some: ten say little of them.
+entropy_bonus, "truncated" tqc_value. Arms that the file of results holds already are left out, but for
+``--again``. The third runs a hundred episodes, for agents that fall in some: ten say little of them.
 """
 
 import argparse
@@ -28,13 +28,12 @@ from matplotlib.figure import Figure
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from benchmarks.common import RESULTS, print_table, read, write
+from benchmarks.common import known_path, parse_args, print_table, read, write, write_picture
 from benchmarks.strategies_arms import ARMS, BUDGETS, SLACK, has_value
 from sb3_mcbs import SearchPolicy, SearchSettings, SnapshotEnvWrapper, load_agent
 from sb3_mcbs.search import PRESETS
 
 FILE = "strategies"
-FIGURE = RESULTS.parents[1] / "docs" / "images" / "strategies.png"
 SEEDS = {"choosing": range(100, 102), "reporting": range(200, 210), "confirming": range(300, 400)}
 #: On whose choosing seeds the arms that are reported of every agent were chosen.
 CHOSEN_WITH = "sac-HalfCheetah-v3"
@@ -164,11 +163,10 @@ def show(rows: list[dict[str, Any]]) -> None:
         print_table(header, sorted(table, key=lambda line: (round(line[5], -1), line[1])))
 
 
-def draw(rows: list[dict[str, Any]], path: Path) -> None:
+def draw(rows: list[dict[str, Any]]) -> None:
     """Draw returns against simulated steps, a panel for every agent.
 
     :param rows: of the file of results.
-    :param path: of the figure.
     """
     agents = sorted({row["agent"] for row in rows})
     columns = min(4, len(agents))
@@ -203,7 +201,36 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
     labelled = [panel.get_legend_handles_labels() for panel in panels]
     handles = {label: handle for pair in labelled for handle, label in zip(*pair, strict=True)}
     figure.legend(handles.values(), handles, loc="outside lower center", ncols=len(handles))
-    figure.savefig(path, dpi=90)
+    write_picture(figure, "strategies.png", dpi=90)
+
+
+def run_arms(agent: OffPolicyAlgorithm, name: str, arms: list[str], arguments: argparse.Namespace) -> None:
+    """Run the arms that were not run before, and say which were not run and why.
+
+    :param agent: the trained agent.
+    :param name: its name in the file of results.
+    :param arms: the arms.
+    :param arguments: the command line.
+    """
+    known, costly = [], []
+    for arm in arms:
+        of = {"agent": name, "environment": arguments.env, "seeds": arguments.seeds, "arm": arm}
+        settings = ARMS[arm]
+        row = {**of, "settings": settings}
+        if not arguments.again and any(row.items() <= other.items() for other in read(FILE)):
+            known.append(arm)
+        elif SearchSettings(**settings).simulated_steps() > arguments.most:
+            costly.append(arm)
+        elif has_value(agent, settings):
+            result = run_arm(agent, arguments.env, SEEDS[arguments.seeds], settings)
+            # Others may have added arms meanwhile, so the file is read again.
+            others = [other for other in read(FILE) if not row.items() <= other.items()]
+            write(FILE, [*others, {**row, **result}])
+            print(arm, f"{np.mean(result['returns']):.0f}", f"{result['simulated steps']:.0f}", flush=True)
+    if known:
+        print(f"Not run, since {known_path(FILE)} has them (--again runs them anew): {'; '.join(known)}")
+    if costly:
+        print(f"Not run, since they simulate more than {arguments.most} steps (--most): {'; '.join(costly)}")
 
 
 def main() -> None:
@@ -213,31 +240,19 @@ def main() -> None:
     parser.add_argument("--seeds", choices=SEEDS, default="choosing")
     parser.add_argument("--arms", choices=ARMS, nargs="+", metavar="ARM", help="only these, in this order")
     parser.add_argument("--most", type=int, default=1000, help="simulated steps of the arms that are run")
+    parser.add_argument("--again", action="store_true", help="also run arms that were measured before")
     parser.add_argument("--table", action="store_true", help="only show what was measured, and draw it")
-    arguments = parser.parse_args()
+    arguments = parse_args(parser)
     if arguments.table:
         show(read(FILE))
-        draw(read(FILE), FIGURE)
+        draw(read(FILE))
         return
+    if arguments.agent is None or arguments.env is None:
+        parser.error("name an agent and its environment, or --table")
     th.set_num_threads(1)
     agent = load_agent(arguments.agent, make_vec_env(arguments.env, 1), device="cpu")
     arms = by_cost(list(ARMS) if arguments.seeds == "choosing" else reported_arms(read(FILE)))
-    for arm in arguments.arms or arms:
-        of = {
-            "agent": arguments.agent.stem,
-            "environment": arguments.env,
-            "seeds": arguments.seeds,
-            "arm": arm,
-        }
-        rows, settings = read(FILE), ARMS[arm]
-        # Others may have added arms meanwhile, so the file is read again.
-        done = any(of.items() <= row.items() and row["settings"] == settings for row in rows)
-        costly = SearchSettings(**settings).simulated_steps() > arguments.most
-        if done or costly or not has_value(agent, settings):
-            continue
-        result = run_arm(agent, arguments.env, SEEDS[arguments.seeds], settings)
-        write(FILE, [*read(FILE), {**of, "settings": settings, **result}])
-        print(arm, f"{np.mean(result['returns']):.0f}", f"{result['simulated steps']:.0f}", flush=True)
+    run_arms(agent, arguments.agent.stem, arguments.arms or arms, arguments)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ import matplotlib
 import numpy as np
 from matplotlib import pyplot
 
-from benchmarks.common import RESULTS, machine, print_table, write
+from benchmarks.common import machine, parse_args, print_table, write, write_picture
 
 ARMS = (
     "SB3 TD3",
@@ -142,7 +142,7 @@ def draw(results: list[dict[str, Any]]) -> None:
         axes.set_xlabel("ms per environment step", fontsize=8)
     all_axes[0, 0].legend(fontsize=7)
     figure.tight_layout()
-    figure.savefig(RESULTS / "training.png", dpi=120)
+    write_picture(figure, "training.png")
 
 
 def main() -> None:
@@ -153,7 +153,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=20)
     parser.add_argument("--steps", type=int, default=30, help="in a round, of each arm")
     parser.add_argument("--sbx-python", default=None, help="interpreter that has sbx-rl")
-    args = parser.parse_args()
+    args = parse_args(parser)
     matplotlib.use("agg")
     print(machine())
     results: list[dict[str, Any]] = []

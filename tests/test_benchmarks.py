@@ -1,21 +1,93 @@
 """The benchmarks still run, small, and count what they say that they count."""
 
+import argparse
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
+from stable_baselines3 import TD3
 
-pytestmark = pytest.mark.slow
+from benchmarks import common
 
 
 @pytest.fixture(autouse=True)
 def results_elsewhere(monkeypatch, tmp_path):
-    from benchmarks import common, memory, scaling, search, training
-
-    for module in (common, memory, scaling, search, training):
-        monkeypatch.setattr(module, "RESULTS", tmp_path)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(common, "output_folder", tmp_path)
 
 
+def run(monkeypatch, module, *words):
+    """Run a benchmark's command."""
+    monkeypatch.setattr("sys.argv", [module.__name__, *words])
+    module.main()
+
+
+def test_results_go_where_the_command_line_says(monkeypatch, capsys):
+    for words, folder in ([], Path("benchmark-results")), (["--output", "a/b"], Path("a/b")):
+        monkeypatch.setattr("sys.argv", ["benchmark", *words])
+        assert vars(common.parse_args(argparse.ArgumentParser())) == {}
+        assert common.write("nothing", [1.5]) == folder / "nothing.json"
+        assert f"Written: {folder / 'nothing.json'}" in capsys.readouterr().out
+        assert common.read("nothing") == [1.5]
+
+
+def test_a_short_run_leaves_the_committed_results_alone(monkeypatch):
+    from benchmarks import deadline
+
+    committed = common.COMMITTED / "deadline.json"
+    before = committed.read_bytes()
+    assert common.read("deadline") == json.loads(before)["results"], "what a benchmark goes on from"
+    run(monkeypatch, deadline, "--env", "Pendulum-v1", "--ms", "1", "--decisions", "10")
+    assert committed.read_bytes() == before
+    assert [row["env"] for row in common.read("deadline")] == ["Pendulum-v1"]
+
+
+def test_arms_that_were_measured_before_are_named(monkeypatch, tmp_path, capsys, make_agent):
+    from benchmarks import strategies
+
+    make_agent(cls=TD3, learning_starts=100).save(tmp_path / "pendulum.zip")
+    ran = []
+    result = {"returns": [-1.0], "simulated steps": 0.0}
+    monkeypatch.setattr(strategies, "run_arm", lambda *arguments: ran.append(arguments) or result)
+    words = ["pendulum.zip", "Pendulum-v1", "--most", "30", "--arms", "actor alone", "beam 10x6"]
+    for again, n_ran in ([], 1), ([], 1), (["--again"], 2):
+        run(monkeypatch, strategies, *again, *words)
+        output = capsys.readouterr().out
+        assert len(ran) == n_ran
+        assert "more than 30 steps (--most): beam 10x6" in output
+    run(monkeypatch, strategies, *words)
+    assert "benchmark-results/strategies.json has them (--again runs them anew): actor alone" in (
+        capsys.readouterr().out
+    )
+    assert [row["returns"] for row in common.read("strategies") if row["agent"] == "pendulum"] == [[-1.0]]
+
+
+def test_any_environment_has_the_costs_of_the_models_that_simulate_it(monkeypatch, capsys):
+    from benchmarks import forward_models
+
+    words = ("--env", "Pendulum-v1", "Hopper-v5", "--rows", "4", "--repetitions", "2")
+    run(monkeypatch, forward_models, *words)
+    _, *lines = capsys.readouterr().out.splitlines()
+    cells = {tuple(line.split()[:2]): line.split()[2:] for line in lines}
+    assert cells["Pendulum-v1", "mujoco"][0] == "cannot:"
+    for row in (("Pendulum-v1", "pool"), ("Hopper-v5", "mujoco"), ("Hopper-v5", "pool")):
+        assert len([float(cell) for cell in cells[row]]) == len(forward_models.COLUMNS)
+
+
+def test_search_outside_mujoco(monkeypatch, tmp_path, capsys):
+    from benchmarks import search
+
+    run(monkeypatch, search, "--env", "Pendulum-v1", "--size", "3,2,2", "--seconds", "0.05")
+    (row,) = common.read("search")
+    missing = {"physics floor ms", "ms / floors", "usual way ms", "usual way / ours"}
+    assert {name for name, value in row.items() if value is None} == missing
+    assert row["simulated steps"] == 3 + 6 and row["control period ms"] == pytest.approx(50)
+    assert "| Pendulum-v1 | (3, 2, 2) |" in capsys.readouterr().out
+    assert common.output_path("search.png").stat().st_size > 0
+
+
+@pytest.mark.slow
 def test_search(tmp_path):
     from benchmarks import search
 
@@ -25,6 +97,7 @@ def test_search(tmp_path):
     assert (tmp_path / "search.png").stat().st_size > 0
 
 
+@pytest.mark.slow
 def test_the_recorded_products_are_those_of_the_search():
     from benchmarks.search import Decision
 
@@ -35,6 +108,7 @@ def test_the_recorded_products_are_those_of_the_search():
     assert [len(states) for states in decision.states] == [3, 6]
 
 
+@pytest.mark.slow
 def test_training(tmp_path, monkeypatch):
     from benchmarks import training
 
@@ -47,8 +121,9 @@ def test_training(tmp_path, monkeypatch):
     assert (tmp_path / "training.png").stat().st_size > 0
 
 
+@pytest.mark.slow
 def test_scaling_and_memory_and_deadline(monkeypatch):
-    from benchmarks import common, deadline, memory, scaling
+    from benchmarks import deadline, memory, scaling
 
     monkeypatch.setitem(scaling.VARIED, "beam_width", (2, 4))
     results = scaling.measure("HalfCheetah-v5", "beam_width", 0.1)
@@ -59,20 +134,16 @@ def test_scaling_and_memory_and_deadline(monkeypatch):
     assert len(memory.over_decisions(agent, 10, 5)) == 3
     assert len(memory.over_training(agent, 10, 5)) == 3
     assert deadline.measure("Pendulum-v1", 0.05, 20)["candidates"] > 0
-    path = common.write("nothing", [1.5])
-    assert json.loads(path.read_text())["results"] == [1.5]
 
 
-def test_learned_model(monkeypatch, tmp_path):
-    from benchmarks import common, learned_model
+@pytest.mark.slow
+def test_learned_model(monkeypatch):
+    from benchmarks import learned_model
 
-    monkeypatch.setattr(common, "RESULTS", tmp_path)
     monkeypatch.setattr(learned_model, "EPISODES", 1)
     arguments = "learned --env Pendulum-v1 --steps 620 --learning-starts 520 --max-error 2"
-    monkeypatch.setattr("sys.argv", ["learned_model", *arguments.split()])
-    learned_model.main()
-    (path,) = tmp_path.glob("learned_model-Pendulum-v1-learned-0.json")
-    results = json.loads(path.read_text())["results"]
+    run(monkeypatch, learned_model, *arguments.split())
+    results = common.read("learned_model-Pendulum-v1-learned-0")
     assert results["decisions searched"] == 99 and results["held-out error"] < 2
     assert set(results["returns"]) == {"actor", "search, ensemble"}
     errors = [row["observation error"] for row in results["error over horizon"]]

@@ -1,5 +1,6 @@
 """How our algorithms get into RL Zoo: by the import hook, and explicitly."""
 
+import argparse
 import importlib
 import os
 import runpy
@@ -9,6 +10,8 @@ import types
 import warnings
 from pathlib import Path
 
+import gymnasium as gym
+import mujoco
 import pytest
 
 import _sb3_mcbs_hook as hook
@@ -50,6 +53,7 @@ def test_register_fills_rl_zoos_tables_and_can_be_repeated() -> None:
         sample = rl_zoo3.exp_manager.HYPERPARAMS_SAMPLER[name]
         assert (sample.func, sample.args) == (sampler.sample_mcbs_params, (name.removeprefix("mcbs_"),))
         assert rl_zoo3.hyperparams_opt.HYPERPARAMS_CONVERTER[name] is sampler.convert_mcbs_params
+    assert rl_zoo3.exp_manager.make_vec_env is rl_zoo3.utils.make_vec_env is registration.make_vec_env
     for module in (rl_zoo3.exp_manager, rl_zoo3.train, rl_zoo3.enjoy):
         assert module.ExperimentManager is MCBSExperimentManager
     assert MCBSExperimentManager.__base__.__module__ == "rl_zoo3.exp_manager"
@@ -65,6 +69,64 @@ def test_register_reaches_commands_that_were_imported_before() -> None:
     rl_zoo3.train.ExperimentManager = MCBSExperimentManager.__base__
     register()
     assert rl_zoo3.train.ExperimentManager is MCBSExperimentManager
+
+
+def stored(dest: str, *words: str) -> dict[str, object]:
+    from rl_zoo3.utils import StoreDict
+
+    parser = argparse.ArgumentParser()
+    parser.add_argument("-params", dest=dest, nargs="+", action=StoreDict)
+    return vars(parser.parse_args(["-params", *words]))[dest]
+
+
+def test_values_that_rl_zoo_evaluates_are_what_they_were() -> None:
+    register()
+    values = {
+        "policy": "None",
+        "policy_kwargs": "dict(activation_fn=nn.ReLU)",
+        "learning_rate": "'lin_0.1'",
+        "env_wrapper": "gym.wrappers.FlattenObservation",
+        "train_freq": "(1, 'episode')",
+        "beam_width": "2 * 3",
+    }
+    evaluated = stored("hyperparams", *(f"{name}:{value}" for name, value in values.items()))
+    import rl_zoo3.utils
+
+    assert evaluated == {name: eval(value, vars(rl_zoo3.utils)) for name, value in values.items()}
+    for dest, word in (("hyperparams", "gamma:high"), ("env_kwargs", "preset:strong")):
+        with pytest.raises(NameError):
+            stored(dest, word)
+
+
+def diverging(**kwargs: object) -> gym.Env:
+    """Make HalfCheetah, and have MuJoCo warn of something else meanwhile."""
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><body><joint/><geom size='1'/></body></worldbody></mujoco>"
+    )
+    data = mujoco.MjData(model)
+    data.qpos[0] = 1e20
+    mujoco.mj_step(model, data)
+    return gym.make("HalfCheetah-v5", **kwargs)
+
+
+def test_only_the_warning_of_half_cheetahs_xml_is_hidden(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    registration.make_vec_env(diverging, env_kwargs={"render_mode": "rgb_array"}).close()
+    errors = capfd.readouterr().err
+    assert "WARNING: Nan, Inf or huge value in QPOS" in errors and "settotalmass" not in errors
+    assert "huge value in QPOS" in (tmp_path / "MUJOCO_LOG.TXT").read_text()
+    assert mujoco.get_mju_user_warning() is None
+    seen: list[str] = []
+    mujoco.set_mju_user_warning(seen.append)
+    try:
+        registration.make_vec_env(diverging).close()
+        assert len(seen) == 1 and "QPOS" in seen[0]
+        gym.make("HalfCheetah-v5").close()
+        assert len(seen) == 2, "what was there before is put back"
+    finally:
+        mujoco.set_mju_user_warning(None)
 
 
 class Loaded(Exception):
@@ -112,8 +174,11 @@ def test_commands_that_show_an_agent_load_no_replay_buffer(
     monkeypatch.delitem(sys.modules, f"rl_zoo3.{command}", raising=False)
     monkeypatch.setattr(sys, "meta_path", [hook.ZooFinder(), *sys.meta_path])
     monkeypatch.setattr(sys, "argv", [command, *words])
+    before = sys.excepthook
+    monkeypatch.setattr(sys, "excepthook", before)
     with pytest.raises(Loaded) as loaded:
         runpy.run_module(f"rl_zoo3.{command}", run_name="__main__")
+    assert sys.excepthook is (hook.name_missing_library if command == "record_video" else before)
     (agent,) = loaded.value.args
     assert type(agent) is ALGORITHMS[algo]
     assert agent.replay_buffer.buffer_size == agent.replay_buffer.observations.shape[0] == 1
@@ -217,6 +282,60 @@ def test_failing_registration_warns_with_the_cause_and_rl_zoo_still_imports(
     with pytest.warns(RuntimeWarning, match=rf"ImportError: libmujoco is missing.*{hook.SWITCH}=1"):
         module = __import__(watched_module)
     assert module.value == 1
+
+
+@pytest.mark.parametrize("words", [["--algo", "mcbs_td3"], ["--env", "Ant-v5", "--algo=mcbs_sac"]])
+def test_failing_registration_ends_a_command_that_asks_for_our_algorithms(
+    words: list[str], watched_module: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(module: types.ModuleType) -> None:
+        raise ImportError("libmujoco is missing")
+
+    monkeypatch.setattr(registration, "after_import", fail)
+    monkeypatch.setattr(sys, "argv", ["-m", *words])
+    with pytest.raises(SystemExit, match=r"ImportError: libmujoco is missing.*force-reinstall"):
+        __import__(watched_module)
+
+
+@pytest.mark.parametrize(("backend", "library"), [("osmesa", "libosmesa6"), ("egl", "libegl1")])
+def test_missing_renderer_is_named(backend: str, library: str, tmp_path: Path) -> None:
+    """PyOpenGL fails with an AttributeError where the library is missing, and MuJoCo's import with it."""
+    (tmp_path / "OpenGL.py").write_text("None.glGetError\n")
+    code = "import _sb3_mcbs_hook, runpy; runpy.run_module('rl_zoo3.record_video', run_name='__main__')"
+    result = subprocess.run(
+        [sys.executable, "-c", code, "--algo", "mcbs_td3", "--env", "HalfCheetah-v5"],
+        capture_output=True,
+        text=True,
+        env={
+            **os.environ,
+            hook.SWITCH: "0",
+            "PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)]),
+            "MUJOCO_GL": backend,
+            "PYOPENGL_PLATFORM": backend,
+        },
+        check=False,
+    )
+    assert result.returncode == 1
+    (line,) = result.stderr.splitlines()
+    assert f"MUJOCO_GL={backend} needs the system library {library}" in line
+
+
+@pytest.mark.parametrize("module", ["gymnasium.envs.mujoco.mujoco_rendering", "elsewhere"])
+def test_failing_renderer_is_one_line_that_names_the_libraries(
+    module: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    try:
+        exec("raise ValueError('no context')", {"__name__": module})
+    except ValueError:
+        hook.name_missing_library(*sys.exc_info())
+    errors = capsys.readouterr().err
+    if module == "elsewhere":
+        assert errors.startswith("Traceback")
+    else:
+        (line,) = errors.splitlines()
+        assert "(ValueError: no context). MUJOCO_GL is unset." in line
+        assert "libosmesa6 and set MUJOCO_GL=osmesa, or libegl1 and MUJOCO_GL=egl" in line
 
 
 def test_other_modules_are_left_alone() -> None:

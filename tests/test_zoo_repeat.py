@@ -1,6 +1,7 @@
 """Repeating a run from the files that RL Zoo saved."""
 
 import argparse
+import sys
 from collections import OrderedDict
 from pathlib import Path
 from typing import Any
@@ -8,8 +9,10 @@ from typing import Any
 import pytest
 import torch as th
 import yaml
-from rl_zoo3.utils import StoreDict
+from rl_zoo3.utils import StoreDict, get_callback_list
 
+from sb3_mcbs import ExactCheckpointCallback
+from sb3_mcbs.zoo import cli
 from sb3_mcbs.zoo import repeat as repeating
 from sb3_mcbs.zoo.repeat import RunLoader, command_line, load_run, repeat
 from tests.zoo_helpers import TINY_SEARCH, monitor_rewards, zoo_train
@@ -115,3 +118,46 @@ def test_missing_agent_to_continue_is_named(tmp_path: Path, monkeypatch: pytest.
         repeat(files.parent)
     monkeypatch.setattr(repeating.train, "main", lambda: None)
     repeat(files.parent, ["-i", "other.zip"])
+
+
+@pytest.fixture
+def saved_run(tmp_path: Path) -> Path:
+    """The folder of a run, as far as commands look at it first."""
+    files = tmp_path / "logs" / "mcbs_td3" / "Pendulum-v1_1" / "Pendulum-v1"
+    files.mkdir(parents=True)
+    (files / "config.yml").write_text(yaml.dump(OrderedDict(policy="MlpPolicy")))
+    (files / "args.yml").write_text(yaml.dump(OrderedDict(env="Pendulum-v1", algo="mcbs_td3")))
+    return files.parent
+
+
+def line_of(monkeypatch: pytest.MonkeyPatch, *words: str) -> str:
+    """What ``sb3-mcbs`` ends with."""
+    monkeypatch.setattr(sys, "argv", ["sb3-mcbs", *map(str, words)])
+    with pytest.raises(SystemExit) as stopped:
+        cli.main()
+    assert isinstance(stopped.value.code, str) and "\n" not in stopped.value.code
+    return stopped.value.code
+
+
+@pytest.mark.parametrize("command", ["resume", "repeat"])
+def test_wrong_folder_is_one_line(
+    command: str, saved_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert "needs <env>/config.yml" in line_of(monkeypatch, command, str(tmp_path / "nowhere"))
+    (saved_run / "Pendulum-v1" / "args.yml").write_text("!!python/object/apply:os.system ['true']")
+    assert "args.yml is not what RL Zoo writes" in line_of(monkeypatch, command, str(saved_run))
+
+
+def test_run_without_checkpoints_says_how_to_make_them(
+    saved_run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    line = line_of(monkeypatch, "resume", str(saved_run))
+    assert f"{saved_run} has no exact checkpoints" in line
+    # What it says can be used as it is.
+    _, words, _ = line.split('"')
+    in_file = yaml.safe_load(line.rpartition("hyperparameter file ")[2].removesuffix("."))
+    parser = argparse.ArgumentParser()
+    parser.add_argument("-params", dest="hyperparams", nargs="+", action=StoreDict)
+    for hyperparams in (parser.parse_args(["-params", words]).hyperparams, in_file):
+        (callback,) = get_callback_list(hyperparams)
+        assert isinstance(callback, ExactCheckpointCallback) and callback.save_freq == 10_000

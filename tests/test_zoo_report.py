@@ -69,6 +69,28 @@ def test_run_without_evaluations_is_named(tmp_path: Path) -> None:
         report(tmp_path)
 
 
+def test_wrong_paths_are_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "evaluations.npz").write_text("no archive")
+    for words, message in (
+        (["report", str(tmp_path / "nowhere")], "There is no folder"),
+        (["report", str(tmp_path)], "--eval-freq smaller"),
+        (["report", str(tmp_path / "run")], "is not what an EvalCallback writes"),
+        (["report", "-f", str(tmp_path)], "Train one first"),
+        (["convert-statistics", str(tmp_path / "no.pkl"), "s.npz", "--trusted"], "No such file"),
+        (
+            ["convert-statistics", str(tmp_path / "run" / "evaluations.npz"), "s.npz", "--trusted"],
+            "unpickled",
+        ),
+    ):
+        monkeypatch.setattr(sys, "argv", ["sb3-mcbs", *words])
+        with pytest.raises(SystemExit, match=f"^sb3-mcbs {words[0]}: .*{message}") as stopped:
+            cli.main()
+        assert "\n" not in str(stopped.value.code)
+
+
 def test_command_hands_its_arguments_on(
     logs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

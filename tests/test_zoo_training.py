@@ -1,5 +1,6 @@
 """Training through RL Zoo's command: hyperparameters found, both policies evaluated, nothing disturbed."""
 
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,9 @@ import yaml
 from stable_baselines3.common.logger import Logger
 
 from sb3_mcbs import MCBSTD3, SearchPolicy, SearchSettings, SnapshotEnvWrapper
+from sb3_mcbs.algorithms.keywords import SETTINGS
 from sb3_mcbs.zoo.callbacks import RenamingLogger, SearchEvalCallback, SecondEvalCallback
+from sb3_mcbs.zoo.manager import NAMES
 from sb3_mcbs.zoo.paths import sibling_folder
 from sb3_mcbs.zoo.registration import ALGORITHMS
 from sb3_mcbs.zoo.repeat import load_run
@@ -148,6 +151,57 @@ def test_mujoco_lands_on_the_batch(
     words = ("-n", "120", "--eval-freq", "-1", "-params", *TINY_SEARCH)
     zoo_train(monkeypatch, tmp_path, "mcbs_td3", *words, env="HalfCheetah-v5")
     assert "Forward model: MuJoCo batch of HalfCheetahEnv" in capsys.readouterr().out
+
+
+def test_nothing_is_said_of_the_xml_of_half_cheetah(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """MuJoCo's reader calls its ``settotalmass`` deprecated: for the training and for each evaluation."""
+    words = ("-n", "110", "--eval-freq", "1000", "-params", *TINY_SEARCH)
+    zoo_train(monkeypatch, tmp_path, "mcbs_td3", *words, env="HalfCheetah-v5")
+    output = capfd.readouterr()
+    assert "Creating second test environment" in output.out
+    assert "settotalmass" not in output.out + output.err
+    assert not (tmp_path / "MUJOCO_LOG.TXT").exists()
+
+
+def test_names_need_no_quotes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = ("preset:strong", "tqc_value:truncated", "noise_type:ornstein-uhlenbeck", "noise_std:0.2")
+    classes = ("policy:MlpPolicy", "env_wrapper:sb3_mcbs.SnapshotEnvWrapper", "matmul_precision:None")
+    words = ("-n", "101", "--eval-freq", "-1", "-params", *TINY, "n_threads:1", *names, *classes)
+    zoo_train(monkeypatch, tmp_path, "mcbs_tqc", *words)
+    config, _ = load_run(tmp_path / "logs" / "mcbs_tqc" / "Pendulum-v1_1")
+    assert (config["preset"], config["policy"], config["matmul_precision"]) == ("strong", "MlpPolicy", None)
+    agent = ALGORITHMS["mcbs_tqc"].load(tmp_path / "logs" / "mcbs_tqc" / "Pendulum-v1_1" / "Pendulum-v1.zip")
+    assert agent.search_settings == SearchSettings.preset("strong", n_threads=1, tqc_value="truncated")
+    assert "OrnsteinUhlenbeck" in repr(agent.action_noise)
+
+
+@pytest.mark.parametrize(
+    ("word", "line"),
+    [
+        ("preset:strng", "there is no such preset; known are paper, efficient, balanced, strong."),
+        ("preset:'strng'", "there is no such preset; known are paper, efficient, balanced, strong."),
+        ("search_unit:episodes", "there is no such search_unit; known are step, episode."),
+        ("include_policy_action:true", "must be a number, True, False or None."),
+    ],
+)
+def test_a_misspelt_value_is_one_line(
+    word: str, line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        zoo_train(monkeypatch, tmp_path, "mcbs_td3", "-n", "101", "-params", *TINY, word)
+    assert stopped.value.code == f"-params {word.replace(chr(39), '')}: {line}"
+
+
+def test_every_setting_that_is_a_name_is_known() -> None:
+    named = {field.name for settings in SETTINGS for field in fields(settings) if "str" in str(field.type)}
+    assert set(NAMES) == {"preset", *named}
+
+
+def test_no_file_of_this_package_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(SystemExit, match=r"-conf sb3_mcbs: .* no hyperparameters for 'ppo'"):
+        zoo_train(monkeypatch, tmp_path, "ppo", "-n", "101", "-conf", "sb3_mcbs")
 
 
 @pytest.mark.parametrize("algo", ALGORITHMS)

@@ -2,6 +2,7 @@
 
 import argparse
 import pickle
+import sys
 from pathlib import Path
 
 from sb3_mcbs.algorithms.normalization import save_statistics
@@ -15,6 +16,7 @@ def convert_statistics(pickle_path: str | Path, npz_path: str | Path, trusted: b
     :param npz_path: the file to write, for ``sb3_mcbs.algorithms.normalization.load_statistics``
     :param trusted: that the caller trusts the pickle's author
     :raises PermissionError: without ``trusted``
+    :raises ValueError: if the file is no pickle, or its code fails
     :raises TypeError: if the file holds something else
     """
     if not trusted:
@@ -23,7 +25,13 @@ def convert_statistics(pickle_path: str | Path, npz_path: str | Path, trusted: b
             "say so with --trusted (trusted=True); else convert it on a machine that has nothing to lose."
         )
     with Path(pickle_path).open("rb") as stream:
-        vec_normalize = pickle.load(stream)
+        try:
+            vec_normalize = pickle.load(stream)
+        except Exception as error:  # whatever the code in it raises
+            raise ValueError(
+                f"{pickle_path} cannot be unpickled ({type(error).__name__}: {error}). Name a file that "
+                "VecNormalize.save or RL Zoo wrote, usually vecnormalize.pkl."
+            ) from error
     save_statistics(vec_normalize, npz_path)
 
 
@@ -46,6 +54,8 @@ def main() -> None:
         convert_statistics(args.pickle_path, args.npz_path, args.trusted)
     except PermissionError as reason:
         parser.error(str(reason))
+    except (OSError, TypeError, ValueError) as error:
+        sys.exit(f"{parser.prog}: {error}")
     print(f"Wrote {args.npz_path}.")
 
 

@@ -1,6 +1,7 @@
 """RL Zoo's ExperimentManager, for agents that search."""
 
 import inspect
+import sys
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -20,11 +21,13 @@ from sb3_mcbs.checkpoints import CheckpointError, ExactCheckpointCallback
 from sb3_mcbs.checkpoints.resume import continue_with
 from sb3_mcbs.checkpoints.resumption import Resumption
 from sb3_mcbs.models import ForwardModelError
-from sb3_mcbs.search import ScheduleSettings, SearchSettings, with_preset
-from sb3_mcbs.search.settings import OF_THE_MACHINE
+from sb3_mcbs.models.factory import KINDS
+from sb3_mcbs.search import PRESETS, ScheduleSettings, SearchSettings, with_preset
+from sb3_mcbs.search.schedule import SCHEDULES, UNITS
+from sb3_mcbs.search.settings import MATMUL_PRECISIONS, OF_THE_MACHINE, STRATEGIES, TQC_VALUES
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 from sb3_mcbs.zoo.callbacks import SearchEvalCallback, SecondEvalCallback
-from sb3_mcbs.zoo.paths import hyperparams_path, sibling_folder
+from sb3_mcbs.zoo.paths import PathError, hyperparams_path, sibling_folder
 from sb3_mcbs.zoo.registration import ALGORITHMS
 from sb3_mcbs.zoo.sampler import HELD
 
@@ -34,6 +37,16 @@ PACKAGE_CONFIG = "sb3_mcbs"
 SEARCHABLE = ("ddpg", "sac", "td3", "tqc")
 #: The folder of exact checkpoints within a run's folder.
 CHECKPOINTS = "checkpoints"
+#: The settings that are names, and what they may be.
+NAMES = {
+    "preset": tuple(PRESETS),
+    "strategy": STRATEGIES,
+    "tqc_value": TQC_VALUES,
+    "forward_model": KINDS,
+    "matmul_precision": MATMUL_PRECISIONS,
+    "search_schedule": SCHEDULES,
+    "search_unit": UNITS,
+}
 
 
 class ResumedRun(NamedTuple):
@@ -74,7 +87,10 @@ class MCBSExperimentManager(ExperimentManager):
         self.search_evaluation: dict[str, Any] | None = None
         config = arguments.get("config")
         if config == PACKAGE_CONFIG or (config is None and self.algo in ALGORITHMS):
-            self.config = str(hyperparams_path(self.algo))
+            try:
+                self.config = str(hyperparams_path(self.algo))
+            except PathError as error:
+                sys.exit(f"-conf {config}: {error}")
         if self.resumed_run is not None:
             self.save_path = str(self.resumed_run.folder)
             self.params_path = f"{self.save_path}/{self.env_name}"
@@ -108,6 +124,8 @@ class MCBSExperimentManager(ExperimentManager):
             trial = self.load_trial(str(self.storage), str(self.study_name), 0)
             self.custom_hyperparams = {**trial, **(self.custom_hyperparams or {})}
         custom = self.custom_hyperparams or {}
+        if self.algo in ALGORITHMS:
+            _check_names(custom)
         if self.algo in ALGORITHMS and custom.get("preset") is not None:
             if self.optimize_hyperparameters:
                 raise ValueError(
@@ -181,6 +199,20 @@ class MCBSExperimentManager(ExperimentManager):
             return self.create_envs(self.n_eval_envs, eval_env=True)
         finally:
             self.env_wrapper = wrapper
+
+
+def _check_names(custom: dict[str, Any]) -> None:
+    """End with one line if text of the command line is not what a setting may be.
+
+    :param custom: hyperparameters of the command line.
+    """
+    for name, value in custom.items():
+        if not isinstance(value, str) or name not in {"preset", *SETTING_NAMES}:
+            continue
+        if name not in NAMES:
+            sys.exit(f"-params {name}:{value}: must be a number, True, False or None.")
+        if value not in NAMES[name]:
+            sys.exit(f"-params {name}:{value}: there is no such {name}; known are {', '.join(NAMES[name])}.")
 
 
 def _settings_of_preset(name: str) -> dict[str, Any]:

@@ -5,13 +5,17 @@ from pathlib import Path
 PACKAGE_ROOT = Path(__file__).resolve().parents[1]
 
 
+class PathError(FileNotFoundError):
+    """A path is not what a command needs; the message says what to name instead."""
+
+
 def hyperparams_path(algo: str) -> Path:
     """
     Find the hyperparameter file of an algorithm, in an installed package or in a checkout.
 
     :param algo: the algorithm's name on RL Zoo's command line, ``mcbs_td3`` or (its baseline) ``td3``
     :return: path of its YAML file
-    :raises FileNotFoundError: if this package has no file for the algorithm
+    :raises PathError: if this package has no file for the algorithm
     """
     folders = [PACKAGE_ROOT / "hyperparams", PACKAGE_ROOT.parent / "hyperparams"]
     for folder in folders:
@@ -19,7 +23,7 @@ def hyperparams_path(algo: str) -> Path:
         if path.is_file():
             return path
     known = sorted({path.stem for folder in folders for path in folder.glob("*.yml")})
-    raise FileNotFoundError(
+    raise PathError(
         f"sb3-mcbs has no hyperparameters for {algo!r}, only for: {', '.join(known) or 'nothing'}. "
         "Name a file of your own with -conf FILE."
     )

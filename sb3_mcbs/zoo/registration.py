@@ -6,12 +6,18 @@ Nothing here may import RL Zoo at the top: the hook calls from the middle of RL 
 """
 
 import importlib
+import re
 import sys
 from collections.abc import Callable
 from functools import partial
 from types import CodeType, ModuleType
 from typing import Any
 
+import gymnasium as gym
+from stable_baselines3.common import env_util
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_mcbs.algorithms.keywords import SETTING_NAMES
 from sb3_mcbs.algorithms.load_agent import ALGORITHMS as KNOWN_ALGORITHMS
 from sb3_mcbs.algorithms.mcbs import MCBS
 from sb3_mcbs.zoo.sampler import convert_mcbs_params, sample_mcbs_params
@@ -20,6 +26,12 @@ from sb3_mcbs.zoo.sampler import convert_mcbs_params, sample_mcbs_params
 ALGORITHMS = {name: cls for name, cls in KNOWN_ALGORITHMS.items() if issubclass(cls, MCBS)}
 #: By these names, and others beside them, RL Zoo's commands know the algorithms that have a replay buffer.
 OFF_POLICY = frozenset(("ddpg", "sac", "td3", "tqc"))
+#: Hyperparameters whose values may be names, which need no quotes on the command line.
+NAMED = frozenset(
+    ("preset", *SETTING_NAMES, "policy", "noise_type", "env_wrapper", "vec_env_wrapper", "callback")
+)
+#: What MuJoCo says whenever it reads HalfCheetah's XML, which is Gymnasium's and nobody here can change.
+DEPRECATION = "compiler attribute 'settotalmass' is deprecated"
 
 
 def register() -> None:
@@ -49,6 +61,79 @@ def after_import(module: ModuleType) -> None:
 
 def _add_algorithms(utils: Any) -> None:
     utils.ALGOS.update(ALGORITHMS)
+    utils.make_vec_env = make_vec_env
+    _accept_names(utils)
+
+
+def _accept_names(utils: Any) -> None:
+    """Let ``-params preset:strong`` mean the text ``"strong"``: RL Zoo takes every value for Python code."""
+    store = utils.StoreDict
+    evaluate = store.__call__
+    if evaluate.__module__ == __name__:
+        return
+
+    def call(self: Any, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+        if self.dest == "hyperparams":
+            values = [_quoted(word, vars(utils)) for word in values]
+        evaluate(self, parser, namespace, values, option_string)
+
+    store.__call__ = call
+
+
+def _quoted(word: str, scope: dict[str, Any]) -> str:
+    """Put quotes around a hyperparameter's value where it is a name that is not defined.
+
+    :param word: of the command line, ``NAME:VALUE``.
+    :param scope: where RL Zoo evaluates values.
+    """
+    name, _, value = word.partition(":")
+    if name in NAMED and re.fullmatch(r"[A-Za-z_][\w.-]*", value):
+        try:
+            eval(value, scope)
+        except NameError:
+            return f"{name}:{value!r}"
+    return word
+
+
+def make_vec_env(env_id: Callable[..., gym.Env], *args: Any, **kwargs: Any) -> VecEnv:
+    """
+    SB3's ``make_vec_env``, without one warning of MuJoCo for each HalfCheetah that is made.
+
+    :param env_id: the callable that makes an environment, as RL Zoo passes it
+    :param args: further arguments of SB3's function
+    :param kwargs: further keyword arguments of SB3's function
+    :return: the environments
+    """
+    return env_util.make_vec_env(_without_deprecation(env_id), *args, **kwargs)
+
+
+def _without_deprecation(make: Callable[..., gym.Env]) -> Callable[..., gym.Env]:
+    hidden = DEPRECATION
+
+    # A worker process gets this function by value, as it is nested: it need not import this package.
+    def make_env(**kwargs: Any) -> gym.Env:
+        import sys
+
+        import mujoco
+
+        show = mujoco.get_mju_user_warning()
+
+        def warn(message: str) -> None:
+            if hidden in message:
+                return
+            if show is not None:
+                show(message)
+            else:  # as MuJoCo does by itself
+                print(f"WARNING: {message}\n", file=sys.stderr)
+                mujoco.mju_writeLog("WARNING", message)
+
+        mujoco.set_mju_user_warning(warn)
+        try:
+            return make(**kwargs)
+        finally:
+            mujoco.set_mju_user_warning(show)
+
+    return make_env
 
 
 def _add_samplers(hyperparams_opt: Any) -> None:
@@ -65,6 +150,7 @@ def _add_manager(exp_manager: Any) -> None:
         return  # manager.py is importing rl_zoo3.exp_manager at this moment; it is announced again at its end
     callbacks = importlib.import_module("sb3_mcbs.zoo.callbacks")
     original = subclass.__base__
+    exp_manager.make_vec_env = make_vec_env
     exp_manager.EvalCallback = callbacks.SearchEvalCallback
     exp_manager.TrialEvalCallback = callbacks.SearchTrialEvalCallback
     # The commands bind the class under their own name when they are imported.

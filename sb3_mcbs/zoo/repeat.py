@@ -12,7 +12,9 @@ from typing import Any
 
 import yaml
 
+from sb3_mcbs.checkpoints import CheckpointError
 from sb3_mcbs.zoo import train
+from sb3_mcbs.zoo.paths import PathError
 
 #: RL Zoo imports a module of this name for its hyperparameters (``-conf``); it exists in this process only.
 CONFIG_MODULE = "sb3_mcbs_repeated_run"
@@ -65,18 +67,24 @@ def load_run(run_folder: str | Path) -> tuple[dict[str, Any], dict[str, Any]]:
 
     :param run_folder: ``LOGS/ALGO/ENV_NUMBER``
     :return: the hyperparameters and the command line arguments of the run
-    :raises FileNotFoundError: if the folder is not that of an RL Zoo run
+    :raises PathError: if the folder is not that of an RL Zoo run
     """
     found = sorted(Path(run_folder).glob("*/args.yml"))
     if len(found) != 1 or not found[0].with_name("config.yml").is_file():
-        raise FileNotFoundError(
+        raise PathError(
             f"{run_folder} is not the folder of an RL Zoo run: it needs <env>/config.yml and <env>/args.yml. "
             "Name a folder such as logs/mcbs_td3/HalfCheetah-v5_1."
         )
-    config, args = (
-        yaml.load(path.read_text(), Loader=RunLoader) for path in (found[0].with_name("config.yml"), found[0])
-    )
-    return dict(config), dict(args)
+    config, args = (_read_yaml(path) for path in (found[0].with_name("config.yml"), found[0]))
+    return config, args
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    try:
+        return dict(yaml.load(path.read_text(), Loader=RunLoader))
+    except (yaml.YAMLError, OSError, ImportError, AttributeError, TypeError, ValueError) as error:
+        reason = " ".join(str(error).split())
+        raise PathError(f"{path} is not what RL Zoo writes for a run: {reason}") from error
 
 
 def command_line(args: dict[str, Any]) -> list[str]:
@@ -111,11 +119,12 @@ def repeat(run_folder: str | Path, extra: Sequence[str] = ()) -> None:
 
     :param run_folder: the folder of the run; the new one lies beside it
     :param extra: arguments of ``rl_zoo3.train`` that replace the run's own
+    :raises PathError: if the folder is not that of a run, or the agent that the run continued is not there
     """
     config, args = load_run(run_folder)
     agent = args.get("trained_agent")
     if agent and not os.path.isfile(agent) and not {"-i", "--trained-agent"}.intersection(extra):
-        raise FileNotFoundError(
+        raise PathError(
             f"The run continued the agent {agent}, which is not there seen from {os.getcwd()}. "
             "Start from the folder where the run was started, or name the agent with -i FILE."
         )
@@ -142,7 +151,10 @@ def main() -> None:
     )
     parser.add_argument("run_folder", help="a run's folder, for example logs/mcbs_td3/HalfCheetah-v5_1")
     args, extra = parser.parse_known_args()
-    repeat(args.run_folder, extra)
+    try:
+        repeat(args.run_folder, extra)
+    except (PathError, CheckpointError) as error:
+        sys.exit(f"{parser.prog}: {error}")
 
 
 if __name__ == "__main__":

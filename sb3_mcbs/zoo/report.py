@@ -1,12 +1,14 @@
 """``python -m sb3_mcbs.zoo.report``: what a run's two policies reach, in two lines and a picture."""
 
 import argparse
+import sys
+import zipfile
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from sb3_mcbs.zoo.paths import sibling_folder
+from sb3_mcbs.zoo.paths import PathError, sibling_folder
 
 ACTOR = "actor alone"
 SEARCH = "actor with search"
@@ -30,15 +32,20 @@ def load_evaluations(folder: str | Path) -> Evaluations:
 
     :param folder: the folder that holds ``evaluations.npz``
     :return: its content
-    :raises FileNotFoundError: if there was no evaluation
+    :raises PathError: if there is no such folder, or no evaluation in it
     """
     path = Path(folder) / "evaluations.npz"
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"{path} does not exist: train with --eval-freq smaller than the run's steps."
+    if not Path(folder).is_dir():
+        raise PathError(
+            f"There is no folder {folder}. Name that of a run, for example logs/mcbs_td3/HalfCheetah-v5_1."
         )
-    with np.load(path) as data:
-        return Evaluations(data["timesteps"], data["results"])
+    if not path.is_file():
+        raise PathError(f"{path} does not exist: train with --eval-freq smaller than the run's steps.")
+    try:
+        with np.load(path) as data:
+            return Evaluations(data["timesteps"], data["results"])
+    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        raise PathError(f"{path} is not what an EvalCallback writes: {error}") from error
 
 
 def load_policies(run_folder: str | Path) -> dict[str, Evaluations]:
@@ -64,11 +71,11 @@ def newest_run(log_folder: str | Path, algo: str, env_id: str) -> Path:
     :param algo: the algorithm's name on RL Zoo's command line
     :param env_id: the environment
     :return: the run's folder
-    :raises FileNotFoundError: if there is none
+    :raises PathError: if there is none
     """
     runs = list((Path(log_folder) / algo).glob(f"{env_id}_[0-9]*/evaluations.npz"))
     if not runs:
-        raise FileNotFoundError(
+        raise PathError(
             f"No evaluated run of {algo} on {env_id} in {log_folder}. Train one first: "
             f"python -m rl_zoo3.train --algo {algo} --env {env_id} --eval-freq 5000 -f {log_folder}"
         )
@@ -129,14 +136,19 @@ def report(run_folder: str | Path) -> list[str]:
 
 def main() -> None:
     """Read the command line, draw and print."""
-    parser = argparse.ArgumentParser(description="Returns and learning curve of the policies of a run.")
+    parser = argparse.ArgumentParser(
+        prog="sb3-mcbs report", description="Returns and learning curve of the policies of a run."
+    )
     parser.add_argument("run_folder", nargs="?", help="a run's folder; without it, the newest run")
     parser.add_argument("--algo", default="mcbs_td3", help="algorithm of the newest run")
     parser.add_argument("--env", default="HalfCheetah-v5", help="environment of the newest run")
     parser.add_argument("-f", "--log-folder", default="logs", help="where RL Zoo logs")
     args = parser.parse_args()
-    folder = args.run_folder or newest_run(args.log_folder, args.algo, args.env)
-    print("\n".join(report(folder)))
+    try:
+        folder = args.run_folder or newest_run(args.log_folder, args.algo, args.env)
+        print("\n".join(report(folder)))
+    except OSError as error:
+        sys.exit(f"{parser.prog}: {error}")
 
 
 if __name__ == "__main__":
