@@ -151,6 +151,7 @@ for _kind_class in (
 
 _kind_by_class: dict[type, Kind | None] = dict.fromkeys(ATOMIC_CLASSES)
 _kind_of_class: dict[type, Kind | None] = {}
+_UNDECIDED: Any = object()
 
 
 def _forget() -> None:
@@ -168,22 +169,16 @@ def kind_of(obj: Any) -> Kind | None:
     :param obj: any object that an environment holds.
     """
     cls = type(obj)
-    try:
-        return _kind_by_class[cls]
-    except KeyError:
-        if isinstance(obj, type):
-            return _kind_of(obj)
-        kind = _kind_by_class[cls] = _decide(obj, cls)
+    kind = _kind_by_class.get(cls, _UNDECIDED)
+    if kind is not _UNDECIDED:
         return kind
-
-
-def _kind_of(cls: type) -> Kind | None:
-    """Return the kind of a class itself."""
-    try:
-        return _kind_of_class[cls]
-    except KeyError:
-        kind = _kind_of_class[cls] = KINDS["class"] if is_made_per_instance(cls, kind_of) else None
+    if isinstance(obj, type):  # classes differ from each other
+        kind = _kind_of_class.get(obj, _UNDECIDED)
+        if kind is _UNDECIDED:
+            kind = _kind_of_class[obj] = KINDS["class"] if is_made_per_instance(obj, kind_of) else None
         return kind
+    kind = _kind_by_class[cls] = _decide(obj, cls)
+    return kind
 
 
 def _decide(obj: Any, cls: type) -> Kind | None:

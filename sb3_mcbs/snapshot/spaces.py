@@ -2,7 +2,6 @@
 
 import operator
 import weakref
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -17,8 +16,6 @@ _GENERATOR = "_np_random"
 #: Bounds of this many bytes at most are compared each time, in case somebody edits them in place.
 _SMALL = 1024
 
-_cached: dict[int, tuple[Any, list[Any], bytes, Definition]] = {}
-
 
 def parts_of(space: spaces.Space) -> list[spaces.Space]:
     """Return a space and the spaces in it.
@@ -28,12 +25,60 @@ def parts_of(space: spaces.Space) -> list[spaces.Space]:
     if isinstance(space, spaces.Box | spaces.Discrete | spaces.MultiBinary):
         return [space]
     parts = [space]
-    for value in vars(space).values():
-        inner = value.values() if isinstance(value, dict) else value
-        for item in inner if isinstance(inner, list | tuple | type({}.values())) else [value]:
-            if isinstance(item, spaces.Space):
-                parts.extend(parts_of(item))
+    for inner in _inner(space):
+        parts.extend(parts_of(inner))
     return parts
+
+
+def _inner(space: spaces.Space) -> list[spaces.Space]:
+    """Return the spaces right within a space."""
+    found = []
+    for value in vars(space).values():
+        items = value.values() if isinstance(value, dict) else value
+        for item in items if isinstance(value, dict | list | tuple) else [value]:
+            if isinstance(item, spaces.Space):
+                found.append(item)
+    return found
+
+
+class _Known:
+    """A space whose definition was made, and what shows that it has not changed since."""
+
+    def __init__(self, space: spaces.Space, definition: Definition) -> None:
+        key = id(space)
+        self.ref = weakref.ref(space, lambda _: _cached.pop(key, None))
+        self.definition = definition
+        self._values = _without_generator(space)
+        self._bounds = [value for value in self._values if _is_small(value)]
+        self._contents = [bounds.tobytes() for bounds in self._bounds]
+        is_leaf = isinstance(space, spaces.Box | spaces.Discrete | spaces.MultiBinary)
+        self._inner = None if is_leaf else [(inner, definition_of(inner)) for inner in _inner(space)]
+
+    def holds(self, space: spaces.Space) -> bool:
+        """Return whether the definition is still that of the space."""
+        values = _without_generator(space)
+        if len(values) != len(self._values) or not all(map(operator.is_, values, self._values)):
+            return False
+        if self._contents != [bounds.tobytes() for bounds in self._bounds]:
+            return False
+        if self._inner is None:
+            return True
+        inner = _inner(space)
+        return len(inner) == len(self._inner) and all(
+            one is other and definition_of(one) is definition
+            for one, (other, definition) in zip(inner, self._inner, strict=True)
+        )
+
+
+_cached: dict[int, _Known] = {}
+
+
+def _without_generator(space: spaces.Space) -> list[Any]:
+    return [value for name, value in vars(space).items() if name != _GENERATOR]
+
+
+def _is_small(value: Any) -> bool:
+    return isinstance(value, np.ndarray) and value.nbytes <= _SMALL and value.dtype != bool
 
 
 def definition_of(space: spaces.Space) -> Definition:
@@ -42,31 +87,13 @@ def definition_of(space: spaces.Space) -> Definition:
     :param space: the space.
     :return: the same object as before, as long as nobody changed the space.
     """
-    own = {name: value for name, value in vars(space).items() if name != _GENERATOR}
-    values = list(own.values())
-    content = b"".join(_content(values))
     known = _cached.get(id(space))
-    if known is not None and known[0]() is space and known[2] == content and _are_same(known[1], values):
-        return known[3]
-    definition = (
-        type(space),
-        tuple((name, _plain(value)) for name, value in own.items() if name != _GENERATOR),
-    )
-    if len(parts_of(space)) == 1:  # others change when a part of them does
-        key = id(space)
-        forget = weakref.ref(space, lambda _: _cached.pop(key, None))
-        _cached[key] = (forget, values, content, definition)
+    if known is not None and known.ref() is space and known.holds(space):
+        return known.definition
+    attributes = tuple((name, _plain(value)) for name, value in vars(space).items() if name != _GENERATOR)
+    definition = (type(space), attributes)
+    _cached[id(space)] = _Known(space, definition)
     return definition
-
-
-def _content(values: list[Any]) -> Iterator[bytes]:
-    for value in values:
-        if isinstance(value, np.ndarray) and value.nbytes <= _SMALL:
-            yield value.tobytes()
-
-
-def _are_same(left: list[Any], right: list[Any]) -> bool:
-    return len(left) == len(right) and all(map(operator.is_, left, right))
 
 
 def _plain(value: Any) -> Any:
@@ -96,9 +123,7 @@ def is_defined_as(space: spaces.Space, definition: Definition) -> bool:
         return True
     if not _equal(own, definition):
         return False
-    known = _cached.get(id(space))
-    if known is not None:  # the next comparison sees that they are the same
-        _cached[id(space)] = (*known[:3], definition)
+    _cached[id(space)].definition = definition  # the next comparison sees that they are the same
     return True
 
 
