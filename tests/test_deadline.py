@@ -158,8 +158,12 @@ def test_settings_are_checked():
     ):
         with pytest.raises(ValueError, match=match):
             settings(**bad)
-    with pytest.raises(TypeError, match="time_budget"):
-        settings(time_budget="fast")
+    for bad, match in (
+        (dict(time_budget="fast"), "time_budget"),
+        (dict(max_beam_width="0"), "max_beam_width"),
+    ):
+        with pytest.raises(TypeError, match=match):
+            settings(**bad)
 
 
 def test_an_agent_trains_and_acts_with_a_budget(make_agent, tmp_path):

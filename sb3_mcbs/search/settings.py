@@ -114,6 +114,8 @@ class SearchSettings(CheckedSettings):
         self._set_integer("noise_hold", 1, MAX_DEPTH)
         if self.proposal_dims is not None:
             self._set_integer("proposal_dims", 1, MAX_ROLLOUTS)
+        if self.max_beam_width is not None:
+            self._set_integer("max_beam_width", self.beam_width, MAX_ROLLOUTS)
         for name in ("beam_noise", "min_noise"):
             self._set_number(name, MAX_NOISE)
         for name in ("rollout_noise", "noise_clip"):
@@ -181,10 +183,8 @@ class SearchSettings(CheckedSettings):
                         f"time_budget evaluates candidates in rounds, which {name} does not: leave one of "
                         "the two out."
                     )
-        if self.max_beam_width is not None:
-            self._set_integer("max_beam_width", self.beam_width, MAX_ROLLOUTS)
-            if self.time_budget is None:
-                raise ValueError("max_beam_width needs a time_budget; without one set beam_width.")
+        if self.max_beam_width is not None and self.time_budget is None:
+            raise ValueError("max_beam_width needs a time_budget; without one set beam_width.")
 
     def _check_strategy(self) -> None:
         chosen = f"strategy={self.strategy!r}"
