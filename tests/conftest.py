@@ -16,6 +16,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from sb3_mcbs import MCBS, MCBSDDPG, MCBSSAC, MCBSTD3, MCBSTQC, SnapshotEnvWrapper
 from sb3_mcbs.algorithms import learned_model
 from sb3_mcbs.models import ensemble, ensemble_network
+from sb3_mcbs.snapshot import registry, verification
 
 # Small networks are fastest on one thread, and idle OpenMP threads would take cores from the simulations.
 th.set_num_threads(1)
@@ -69,6 +70,23 @@ def make_agent() -> Callable[..., MCBS]:
 @pytest.fixture
 def make_dict_env() -> Callable[[], gym.Env]:
     return lambda: DictPendulum(gym.make("Pendulum-v1"))
+
+
+@pytest.fixture
+def own_adapters() -> Iterator[None]:
+    """Forget the adapters that a test registers."""
+    before = list(registry._registered)
+    yield
+    registry._registered[:] = before
+    registry._by_class.clear()
+    for forget in registry._on_change:
+        forget()
+
+
+@pytest.fixture
+def nothing_has_passed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Environments are checked as in a new process."""
+    monkeypatch.setattr(verification, "_passed", type(verification._passed)())
 
 
 @pytest.fixture(scope="module")

@@ -8,13 +8,20 @@ from sb3_mcbs.models.base import ForwardModel, Transition
 class LineWorld(ForwardModel):
     """A point on a line: ``x += action`` and the reward is ``-x**2``.
 
-    It terminates beyond ``|x| > limit`` and diverges where an action is larger than ``bad_action``.
+    It terminates beyond ``|x| > limit``, truncates the episode beyond ``|x| > stop`` and diverges where an
+    action is larger than ``bad_action``.
     With ``spread`` above 0 every step adds noise from the generator given to :meth:`set_roots`.
     """
 
-    def __init__(self, limit: float = np.inf, bad_action: float = np.inf, spread: float = 0.0) -> None:
+    def __init__(
+        self,
+        limit: float = np.inf,
+        bad_action: float = np.inf,
+        spread: float = 0.0,
+        stop: float = np.inf,
+    ) -> None:
         self.deterministic = spread == 0
-        self.limit, self.bad_action, self.spread = limit, bad_action, spread
+        self.limit, self.bad_action, self.spread, self.stop = limit, bad_action, spread, stop
         self.x = np.zeros(0)
         self.steps_taken = 0
 
@@ -39,7 +46,12 @@ class LineWorld(ForwardModel):
         self.x = self.x + actions[:, 0]
         if self.spread:
             self.x = self.x + self.spread * self.rng.standard_normal(self.n_rows)
-        observations = self.x[:, None].copy()
+        observations, distance = self.x[:, None].copy(), np.abs(self.x)
+        stopped = distance > self.stop
         return Transition(
-            observations, -(self.x**2), np.abs(self.x) > self.limit, actions[:, 0] <= self.bad_action
+            observations,
+            -(self.x**2),
+            distance > self.limit,
+            actions[:, 0] <= self.bad_action,
+            stopped if stopped.any() else None,
         )

@@ -47,17 +47,32 @@ def reference_values(model, root, noise, env, **soft):
 
     def env_step(action):
         world["x"] += float(action[0])
-        return np.array([world["x"]]), -(world["x"] ** 2), abs(world["x"]) > model.limit
+        observation, reward, distance = np.array([world["x"]]), -(world["x"] ** 2), abs(world["x"])
+        if model.stop < distance <= model.limit:  # ends like a termination, but what would follow counts
+            mean = policy(observation)
+            bonus = soft["entropy"](observation, mean) if soft else 0.0
+            reward += GAMMA * (min(critics(observation, mean)) + bonus)
+        return observation, reward, distance > min(model.limit, model.stop)
 
     reference = Reference(env_step, restore, lambda obs: policy(obs), critics, GAMMA, **soft)
     return reference.choose(np.array([float(root)]), noise.beam[env], noise.rollout[:, env])
 
 
-@pytest.mark.parametrize("limit", [np.inf, 1.4, 0.5], ids=["endless", "terminates", "terminates-at-once"])
+LIMITS = {
+    "endless": {},
+    "terminates": dict(limit=1.4),
+    "terminates-at-once": dict(limit=0.5),
+    "stops": dict(stop=1.2),
+    "stops-at-once": dict(stop=0.5),
+    "stops-or-terminates": dict(limit=1.6, stop=1.2),
+}
+
+
+@pytest.mark.parametrize("world", LIMITS.values(), ids=LIMITS)
 @pytest.mark.parametrize("width, depth, sims", [(1, 1, 1), (6, 3, 5), (4, 1, 3), (3, 7, 2)])
 @pytest.mark.parametrize("agent, soft", [(AGENT, {}), (SOFT_AGENT, dict(entropy=entropy))], ids=["", "soft"])
-def test_equals_the_reference(width, depth, sims, limit, agent, soft):
-    model = LineWorld(limit)
+def test_equals_the_reference(width, depth, sims, world, agent, soft):
+    model = LineWorld(**world)
     settings = SearchSettings(width, depth, sims, beam_noise=0.5, entropy_bonus=bool(soft))
     roots = [0.3, -1.2, 1.0]
     noise = draw_noise(np.random.default_rng(0), settings, len(roots), 1)

@@ -5,11 +5,19 @@ import gc
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium import spaces
+from gymnasium.wrappers import RescaleAction, TransformObservation
 from sb3_contrib import TQC
 from stable_baselines3 import DDPG, PPO, SAC, TD3
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize, sync_envs_normalization
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    SubprocVecEnv,
+    VecNormalize,
+    VecTransposeImage,
+    sync_envs_normalization,
+)
 
 from sb3_mcbs import MCBSTD3, SearchPolicy, SearchSettings, SnapshotEnvWrapper
 from sb3_mcbs.models.copies import _COPIES
@@ -119,6 +127,80 @@ def test_gym_environment(make_agent):
     action, _ = policy.predict(observation)
     assert action.shape == (1,)
     env.step(action)
+
+
+class Pictures(gym.Env):
+    """Observations are images with the channels last, which SB3 transposes."""
+
+    action_space = spaces.Box(-1, 1, (1,))
+
+    def __init__(self, keyed=False):
+        self.keyed, image = keyed, spaces.Box(0, 255, (40, 40, 3), np.uint8)
+        self.observation_space = (
+            spaces.Dict({"image": image, "age": spaces.Box(0, 9, (1,))}) if keyed else image
+        )
+
+    def observe(self):
+        image = np.zeros((40, 40, 3), np.uint8)
+        image[self.age, :, self.age % 3] = 200
+        return {"image": image, "age": np.array([self.age], np.float32)} if self.keyed else image
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.age = 0
+        return self.observe(), {}
+
+    def step(self, action):
+        self.age += 1
+        return self.observe(), float(action[0]), False, self.age >= 5, {}
+
+
+@pytest.mark.parametrize("keyed", [False, True], ids=["image", "dict"])
+def test_images_as_sb3_takes_them(keyed):
+    policy = "MultiInputPolicy" if keyed else "CnnPolicy"
+    extractor = dict(cnn_output_dim=8) if keyed else dict(features_dim=8)
+    networks = dict(net_arch=[8], features_extractor_kwargs=extractor)
+    agent = TD3(policy, Pictures(keyed), seed=0, buffer_size=10, device="cpu", policy_kwargs=networks)
+    chosen = []
+    for wrap in (lambda env: env, VecTransposeImage):
+        env = wrap(DummyVecEnv([lambda: Pictures(keyed)]))
+        searching = SearchPolicy(agent, env, seed=0, **SMALL_SEARCH)
+        observations = env.reset()  # the channels last, or first
+        for _ in range(2):
+            actions, _ = searching.predict(observations)
+            chosen.append(actions)
+            predicted = searching.last_result.first_step.observations
+            observations, *_ = env.step(actions)
+        image = predicted["image"] if keyed else predicted
+        assert image.shape == (1, 40, 40, 3)
+        mean, _ = evaluate_policy(searching, env, n_eval_episodes=1, warn=False)
+        assert -5 <= mean <= 5
+    np.testing.assert_array_equal(chosen[:2], chosen[2:])
+
+
+@pytest.mark.parametrize("env_id, n_entries", [("MountainCarContinuous-v0", 2), ("InvertedPendulum-v5", 4)])
+def test_other_observations_are_refused(make_agent, env_id, n_entries):
+    spaces_in_words = rf"observation space Box\(.*\(3,\).* and vec_env has Box\(.*\({n_entries},\)"
+    with pytest.raises(ValueError, match=rf"trained with the {spaces_in_words}.*same id, arguments and wrap"):
+        SearchPolicy(make_agent(), make_vec_env(env_id, 1))
+
+
+def test_other_actions_are_refused(make_agent):
+    narrow = make_vec_env(
+        "Pendulum-v1", 1, wrapper_class=RescaleAction, wrapper_kwargs=dict(min_action=-1, max_action=1)
+    )
+    with pytest.raises(ValueError, match=r"action space Box\(-2.* and vec_env has Box\(-1"):
+        SearchPolicy(make_agent(), narrow)
+    keyed = DummyVecEnv([lambda: Pictures(keyed=True)])
+    with pytest.raises(ValueError, match="observation space"):
+        SearchPolicy(make_agent(), keyed)
+
+
+def test_bounds_of_observations_do_not_matter(make_agent):
+    wide = DummyVecEnv(
+        [lambda: TransformObservation(gym.make("Pendulum-v1"), abs, spaces.Box(-99, 99, (3,)))]
+    )
+    assert SearchPolicy(make_agent(), wide, seed=0).predict(wide.reset())[0].shape == (1, 1)
 
 
 def test_torch_threads_are_put_back(make_agent, monkeypatch):

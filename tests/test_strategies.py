@@ -28,8 +28,12 @@ def line_reference(model: LineWorld, root: float) -> Reference:
 
     def env_step(action):
         world["x"] += float(action[0])
+        observation, distance = np.array([world["x"]]), abs(world["x"])
         reward = -(world["x"] ** 2) if action[0] <= model.bad_action else np.nan
-        return np.array([world["x"]]), reward, abs(world["x"]) > model.limit
+        terminated, stopped = distance > model.limit, distance > model.stop
+        if stopped and not terminated:  # ends like a termination, but what would follow counts
+            reward += GAMMA * min(critics(observation, policy(observation)))
+        return observation, reward, terminated or stopped
 
     return Reference(env_step, restore, policy, critics, GAMMA)
 
@@ -82,6 +86,10 @@ WORLDS = {
     "terminates-everywhere": dict(limit=0.0),
     "diverges": dict(bad_action=0.2),
     "both": dict(limit=1.3, bad_action=0.4),
+    "stops": dict(stop=1.1),
+    "stops-at-once": dict(stop=0.5),
+    "stops-everywhere": dict(stop=0.0),
+    "all": dict(limit=1.5, bad_action=0.4, stop=1.1),
     "hopeless": dict(bad_action=-2.0),
 }
 TREES = [

@@ -149,7 +149,9 @@ class ExactCheckpointCallback(BaseCallback):
         """Take stock of the run, once all of it is there, and continue a saved one if that is wanted."""
         assert agent.env is not None and agent.replay_buffer is not None
         root = self.locals["callback"]
-        self._run, self._begun = RunState(agent, root), True
+        run = RunState(agent, root)
+        run.verify()  # the first checkpoint of this call may be one whose failure is only a warning
+        self._run, self._begun = run, True
         self._settings = describe_agent(agent)
         self._vec_env = describe_vec_env(agent.env)
         self._position, self._rows_added = agent.replay_buffer.pos, rows_held(agent.replay_buffer)

@@ -19,6 +19,7 @@ import numpy as np
 import torch as th
 
 from sb3_mcbs.checkpoints.errors import CheckpointError
+from sb3_mcbs.snapshot.classes import ClassName
 from sb3_mcbs.snapshot.functions import FunctionName
 from sb3_mcbs.snapshot.graph import Ref, class_name
 
@@ -174,7 +175,9 @@ class Encoder:
 
     def _name(self, value: Any) -> str:
         name = name_of(value)
-        self.names[name] = value.function if isinstance(value, FunctionName) else value
+        if isinstance(value, FunctionName | ClassName):
+            value = value.function if isinstance(value, FunctionName) else value.cls
+        self.names[name] = value
         return name
 
 
@@ -245,7 +248,8 @@ class Decoder:
                 "trust it, pass it: resume(path, classes=[...])."
             )
         value = self._names[name]
-        return FunctionName(value) if name.startswith("function ") else value
+        wrap = _WRAPPED.get(name.partition(" ")[0])
+        return value if wrap is None else wrap(value)
 
 
 _TAGS: dict[str, Callable[[Decoder, Any], Any]] = {
@@ -265,6 +269,10 @@ _TAGS: dict[str, Callable[[Decoder, Any], Any]] = {
 }
 
 
+#: What stands for a function, or for a class that was made inside one: by the first word of its name.
+_WRAPPED: dict[str, Any] = {"function": FunctionName, "local": ClassName}
+
+
 def name_of(value: Any) -> str:
     """Return the name that stands for a class or function, or for a constant of another kind.
 
@@ -273,9 +281,10 @@ def name_of(value: Any) -> str:
     """
     if isinstance(value, type):
         return f"class {class_name(value)}"
-    if isinstance(value, FunctionName):
-        digest = hashlib.sha256(repr(value.code).encode()).hexdigest()[:16]
-        return f"function {value.module}.{value.qualname} {digest}"
+    for word, cls in _WRAPPED.items():
+        if isinstance(value, cls):
+            digest = hashlib.sha256(repr(value.code).encode()).hexdigest()[:16]
+            return f"{word} {value.module}.{value.qualname} {digest}"
     if isinstance(value, re.Pattern | np.ufunc):
         return f"constant {value!r}"
     qualname = getattr(value, "__qualname__", None)

@@ -142,6 +142,7 @@ def describe_environment(wrapper: SnapshotEnvWrapper) -> dict[str, Any] | None:
         "id": spec.id,
         "arguments": arguments,
         "max_episode_steps": spec.max_episode_steps,
+        "verify": wrapper.verifies,
         "monitor": None,
     }
     if monitors:
@@ -184,7 +185,7 @@ def make_environment(description: dict[str, Any]) -> SnapshotEnvWrapper:
             info_keywords=tuple(monitor["info_keywords"]),
             override_existing=False,  # emptied only when the run goes on
         )
-    return SnapshotEnvWrapper(env)
+    return SnapshotEnvWrapper(env, verify=description.get("verify", True))
 
 
 register_state(Episode, tuple, lambda data: Episode(*data))

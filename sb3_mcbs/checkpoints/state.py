@@ -25,7 +25,7 @@ from sb3_mcbs.checkpoints.files import file_of, open_log_files, read_written, re
 from sb3_mcbs.checkpoints.kinds import KINDS, kind_of
 from sb3_mcbs.checkpoints.names import known_names
 from sb3_mcbs.models import Environments, WorkerEnvironments
-from sb3_mcbs.snapshot import SnapshotError, SnapshotUnsupportedError
+from sb3_mcbs.snapshot import SnapshotEnvWrapper, SnapshotError, SnapshotUnsupportedError
 from sb3_mcbs.snapshot.attributes import freeze_attributes, thaw_attributes
 from sb3_mcbs.snapshot.graph import Freezer, Ref, Thawer, class_name
 
@@ -78,6 +78,14 @@ class RunState:
     def class_names(self) -> dict[str, str]:
         """The class of every component, by name."""
         return {name: class_name(type(part)) for name, part in self._components.items()}
+
+    def verify(self) -> None:
+        """Check that the state of every environment that has been reset can be captured exactly.
+
+        :raises SnapshotUnsupportedError: if that of one cannot.
+        """
+        for environments in self._environments.values():
+            environments.apply(range(len(environments)), SnapshotEnvWrapper.verify)
 
     def capture(self) -> Captured:
         """Read the state.

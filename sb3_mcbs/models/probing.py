@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_mcbs.snapshot import SnapshotAdapter, SnapshotEnvWrapper, SnapshotError, SnapshotUnsupportedError
+from sb3_mcbs.snapshot import SnapshotAdapter, SnapshotEnvWrapper, SnapshotUnsupportedError
 from sb3_mcbs.snapshot.global_generators import global_states, isolated_globals
 from sb3_mcbs.snapshot.registry import find_adapter
-from sb3_mcbs.snapshot.spaces import random_action
+from sb3_mcbs.snapshot.spaces import random_action, values_of
 
 logger = logging.getLogger("sb3_mcbs")
 
@@ -27,23 +27,6 @@ class Randomness(NamedTuple):
     shared: bool
 
 
-def verify_if_possible(wrapper: SnapshotEnvWrapper) -> bool:
-    """Check the snapshots of an environment, see :meth:`SnapshotEnvWrapper.verify`.
-
-    :param wrapper: the environment.
-    :return: False if it cannot be reset yet, as without ``options``.
-    :raises SnapshotUnsupportedError: if it does not pass.
-    """
-    try:
-        wrapper.verify()
-    except SnapshotError:
-        raise
-    except Exception as error:
-        logger.debug("cannot check %s yet: %s: %s", wrapper, type(error).__name__, error)
-        return False
-    return True
-
-
 def _comparable(state: Any) -> str:
     with np.printoptions(threshold=sys.maxsize):
         return repr(state)
@@ -53,6 +36,10 @@ def _shared_generators() -> list[str]:
     python_state, numpy_state, torch_state = global_states()
     torch_numbers = None if torch_state is None else torch_state.tolist()
     return [_comparable(state) for state in (python_state, numpy_state, torch_numbers)]
+
+
+def _content(value: np.ndarray) -> Any:
+    return repr(value.tolist()) if value.dtype.hasobject else value.tobytes()
 
 
 def _own_generators(env: SnapshotEnvWrapper) -> list[str]:
@@ -103,8 +90,8 @@ class _Probe:
             except Exception as error:
                 return [*seen, f"{type(error).__name__}: {error}"]
             observation, reward, terminated, truncated, _ = result
-            values = observation.values() if isinstance(observation, dict) else (observation,)
-            seen.append(([np.asarray(value).tobytes() for value in values], repr(reward), bool(terminated)))
+            values = [_content(value) for value in values_of(observation)]
+            seen.append((values, repr(reward), bool(terminated)))
             if terminated or truncated:
                 break
         return seen
@@ -120,16 +107,18 @@ def probe_randomness(wrapper: SnapshotEnvWrapper) -> Randomness | None:
     :raises SnapshotUnsupportedError: if steps cannot be repeated although nothing was drawn: then part of the
         state is not captured.
     """
-    if not verify_if_possible(wrapper):
+    if not wrapper.verify():
         return None
     copied = wrapper.clone()
     try:
-        probe = _Probe(copied)
+        probe, present = _Probe(copied), copied.snapshot()
         for start in range(_STARTS):
             try:
                 copied.reset(seed=start, options=wrapper.reset_arguments["options"])
             except Exception:
-                return None
+                if wrapper.last_observation is None:
+                    return None
+                copied.restore(present)  # some allow no reset in the middle of an episode
             probe.look(start)
         drawn = probe.own or probe.shared
         if probe.differs and not drawn and not _draws_elsewhere(copied):

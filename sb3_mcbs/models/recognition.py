@@ -14,7 +14,6 @@ import numpy as np
 from sb3_mcbs.models.base import ForwardModelError
 from sb3_mcbs.models.engines import INTEGRATION
 from sb3_mcbs.models.families import Constants, Fields, family_of, known_families
-from sb3_mcbs.models.probing import verify_if_possible
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 from sb3_mcbs.snapshot.layers import replaced_method
 from sb3_mcbs.snapshot.spaces import random_action
@@ -113,7 +112,7 @@ def recognize(wrapper: SnapshotEnvWrapper) -> KnownEnvironment | Refusal:
         return Refusal(
             f"{full_name(base_class)} has no {', '.join(missing)}, which its family reads", notable
         )
-    verify_if_possible(wrapper)
+    wrapper.verify()
     attributes = {name: getattr(layer, name) for name in family.attributes}
     constants = Constants(layer.model, layer.frame_skip, attributes)  # type: ignore[attr-defined]
     return KnownEnvironment(type(layer), constants, pickle.dumps(layer.model))  # type: ignore[attr-defined]

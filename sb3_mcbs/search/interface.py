@@ -117,7 +117,7 @@ def stopped_values(step: Transition, agent: Agent) -> tuple[np.ndarray, np.ndarr
     """Value the rows of a step whose episode the environment itself truncated.
 
     :param step: ``[rows]``, with ``stopped``.
-    :param agent: its critics value what its policy would do there.
+    :param agent: its critics value what its policy would do there, with its entropy if that counts.
     :return: which rows ``[n]``, and their values ``[n]`` in float64.
     """
     assert step.stopped is not None
@@ -125,7 +125,11 @@ def stopped_values(step: Transition, agent: Agent) -> tuple[np.ndarray, np.ndarr
     if not len(rows):
         return rows, np.zeros(0)
     observations = take_rows(step.observations, rows)
-    return rows, agent.value(observations, agent.policy(observations)).astype(np.float64)
+    actions = agent.policy(observations)
+    values = agent.value(observations, actions).astype(np.float64)
+    if agent.entropy_bonus is not None:
+        values += agent.entropy_bonus(observations, actions).astype(np.float64)
+    return rows, values
 
 
 def map_arrays(function: Callable[[np.ndarray], Any], observations: Observations) -> Any:

@@ -25,29 +25,42 @@ class ArrayKind:
             return "objects", obj.shape, obj.dtype, _order(obj), items
         content = obj.copy(order="K")
         content.setflags(write=False)
-        borrowed = obj.base is not None and _is_borrowed(obj)
-        return "borrowed" if borrowed else "own", content, obj.flags.writeable
+        if obj.base is not None and _is_borrowed(obj):
+            return "borrowed", content, freezer.places.find(obj)
+        return "own", content, obj.flags.writeable
 
     def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
         form = payload[0]
         if form == "own":
+            if thawer.is_original(index, current) and _is_alike(current, *payload[1:]):
+                thawer.do_then(_write, current, payload[1])
+                return current
             return _with_flag(payload[1].copy(order="K"), payload[2])
         if form == "view":
-            return _view_of(thawer.thaw(payload[1]), payload[2])
+            base, layout = thawer.thaw(payload[1]), payload[2]
+            stays = thawer.is_original(index, current) and _lies_in(current, base, layout)
+            return current if stays else _view_of(base, layout)
         if form == "objects":
             _, shape, dtype, order, items = payload
-            made = thawer.memo[index] = np.empty(shape, dtype, order)
+            made = np.empty(shape, dtype, order)
+            stays = thawer.is_original(index, current) and current.shape == shape
+            thawer.memo[index] = current if stays else made
             for place, item in zip(np.ndindex(shape), items, strict=True):
                 made[place] = thawer.thaw(item)
-            return made
-        content = payload[1]
+            if stays:
+                thawer.do_then(_write, current, made)
+            return thawer.memo[index]
+        content, place = payload[1:]
+        stays = thawer.is_original(index, current)
+        view = current if stays else thawer.places.view_at(place, current)
+        if view is not current:
+            return view
         if not isinstance(current, np.ndarray) or current.shape != content.shape or not _is_borrowed(current):
             raise SnapshotMismatchError(
                 f"The snapshot holds a view of shape {content.shape} into memory that is not an array's, "
                 "and this environment has none at its place."
             )
-        if current.flags.writeable:
-            thawer.do_then(np.copyto, current, content)
+        thawer.do_then(_write, current, content)
         return current
 
     def copy(self, copier: Copier, obj: np.ndarray) -> Any:
@@ -87,6 +100,9 @@ class BytearrayKind:
         return bytes(obj)
 
     def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
+        if thawer.is_original(index, current) and len(current) == len(payload):
+            thawer.do_then(current.__setitem__, slice(None), payload)
+            return current
         return bytearray(payload)
 
     def copy(self, copier: Copier, obj: bytearray) -> Any:
@@ -159,6 +175,21 @@ def _view_of(base: Any, layout: tuple[Any, ...]) -> np.ndarray:
         # Objects cannot be looked at as bytes.
         memory = memory if base.dtype.hasobject else memory.view(np.uint8)
     return _with_flag(np.ndarray(shape, dtype, memory, offset, strides), writeable)
+
+
+def _lies_in(view: np.ndarray, base: Any, layout: tuple[Any, ...]) -> bool:
+    """Return whether an array is a view that lies somewhere."""
+    its_base, its_layout = (None, None) if view.base is None else _base_and_layout(view)
+    return its_base is base and its_layout == layout
+
+
+def _is_alike(values: np.ndarray, others: np.ndarray, writeable: bool) -> bool:
+    return (values.shape, values.dtype, values.flags.writeable) == (others.shape, others.dtype, writeable)
+
+
+def _write(values: np.ndarray, content: np.ndarray) -> None:
+    if values.flags.writeable:
+        np.copyto(values, content)
 
 
 def _with_flag(values: np.ndarray, writeable: bool) -> np.ndarray:

@@ -34,12 +34,20 @@ def freeze_attributes(
             if frozen is not None:
                 attributes[name] = frozen[0]
         else:
-            try:
-                attributes[name] = freezer.freeze(value)
-            except SnapshotUnsupportedError as error:
-                error.path.insert(0, f"{type(env).__name__}.{name}")
-                raise
+            attributes[name] = _freeze(freezer, env, name, value)
     return attributes
+
+
+def _freeze(freezer: Freezer, env: Any, name: str, value: Any) -> Any:
+    try:
+        return freezer.freeze(value)
+    except SnapshotUnsupportedError as error:
+        error.path.insert(0, f"{type(env).__name__}.{name}")
+        raise
+    except RecursionError as error:
+        too_deep = SnapshotUnsupportedError("objects in it hold each other too many levels deep")
+        too_deep.path.append(f"{type(env).__name__}.{name}")
+        raise too_deep from error
 
 
 def thaw_attributes(

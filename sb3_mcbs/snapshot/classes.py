@@ -1,5 +1,6 @@
 """Classes that are made inside a function, once per instance: what their methods close over is state."""
 
+import abc
 import contextlib
 import dis
 import enum
@@ -58,6 +59,18 @@ class ClassName:
             and _code_of(other) == self.code
         )
 
+    def find(self) -> type:
+        """Return the class.
+
+        :raises SnapshotMismatchError: in another process, where nobody can find it.
+        """
+        if self.cls is None:
+            raise SnapshotMismatchError(
+                f"The snapshot is of an environment that uses the class {self.module}.{self.qualname}, which "
+                "is made inside a function; this one has another at its place."
+            )
+        return self.cls
+
 
 def _code_of(cls: type) -> tuple[Any, ...]:
     return tuple(
@@ -100,33 +113,68 @@ def _members(cls: type) -> Iterator[tuple[str, Any]]:
             yield name, member
 
 
+def is_local(cls: type) -> bool:
+    """Return whether a class was made inside a function.
+
+    :param cls: the class.
+    """
+    return "<" in cls.__qualname__ and not issubclass(cls, enum.Enum)
+
+
 def is_made_per_instance(cls: type, kind_of: Callable[[Any], Any]) -> bool:
     """Return whether a class has state: it was made inside a function, and holds or closes over some.
 
     :param cls: the class.
     :param kind_of: the kind of an object; None if it never changes.
     """
-    bases = [base for base in cls.__mro__ if "<" in base.__qualname__]
-    return bool(bases) and not issubclass(cls, enum.Enum) and any(_has_state(base, kind_of) for base in bases)
+    return _StateSearch(kind_of).is_state(cls)
 
 
-def _has_state(cls: type, kind_of: Callable[[Any], Any]) -> bool:
-    parts = [part for _, member in _members(cls) for part in _parts(member)]
-    functions = [part for part in parts if isinstance(part, types.FunctionType)]
-    rebound = {name for function in functions for name in _rebound(function.__code__)}
-    return any(_is_state(part, kind_of) for part in parts) or any(
-        _is_state(content, kind_of) or name in rebound
-        for function in functions
-        for name, content in _variables(function)
-        if name != "__class__"
-    )
+class _StateSearch:
+    """Looks for state among what a class holds and closes over.
+
+    :param kind_of: the kind of an object; None if it never changes.
+    """
+
+    def __init__(self, kind_of: Callable[[Any], Any]) -> None:
+        self._kind_of = kind_of
+        self._seen: list[Any] = []  # classes and functions, which may refer to each other
+
+    def is_state(self, value: Any) -> bool:
+        if isinstance(value, tuple | frozenset):
+            return any(map(self.is_state, value))
+        if not isinstance(value, type | types.FunctionType):
+            kind = self._kind_of(value)
+            return kind is not None and kind.name not in _SHARED_KINDS
+        if any(value is one for one in self._seen):
+            return False
+        self._seen.append(value)
+        if isinstance(value, types.FunctionType):
+            return "<" in value.__qualname__ and self._has_state([value])
+        if issubclass(value, enum.Enum):
+            return False
+        return any(self._has_state(_parts_of(base)) for base in value.__mro__ if "<" in base.__qualname__)
+
+    def _has_state(self, parts: list[Any]) -> bool:
+        """Return whether some of the parts of a class, or a function alone, are state or hold some."""
+        functions = [part for part in parts if isinstance(part, types.FunctionType)]
+        rebound = {name for function in functions for name in _rebound(function.__code__)}
+        variables = [variable for function in functions for variable in _variables(function)]
+        held = [value for function in functions for value in _held(function)]
+        contents = [content for name, content in variables if name != "__class__"]
+        return any(name in rebound for name, _ in variables) or any(
+            map(self.is_state, (*parts, *held, *contents))
+        )
 
 
-def _is_state(value: Any, kind_of: Callable[[Any], Any]) -> bool:
-    if isinstance(value, type | types.FunctionType):
-        return False  # those with state are met on their own
-    kind = kind_of(value)
-    return kind is not None and kind.name not in _SHARED_KINDS
+def _parts_of(cls: type) -> list[Any]:
+    return [part for _, member in _members(cls) for part in _parts(member)]
+
+
+def _held(function: types.FunctionType) -> list[Any]:
+    """The defaults and the attributes of a function."""
+    attributes = [value for name, value in vars(function).items() if name != "__wrapped__"]
+    return [*(function.__defaults__ or ()), *(function.__kwdefaults__ or {}).values(), *attributes]
 
 
 def _variables(function: types.FunctionType) -> Iterator[tuple[str, Any]]:
@@ -144,6 +192,21 @@ def _rebound(code: types.CodeType) -> Iterator[str]:
     for constant in code.co_consts:
         if isinstance(constant, types.CodeType):
             yield from _rebound(constant)
+
+
+class LocalClassKind:
+    """Other classes that are made inside functions: another instance of the environment may have its own."""
+
+    name = "local class"
+
+    def freeze(self, freezer: Freezer, obj: type) -> Any:
+        return ClassName(obj)
+
+    def thaw(self, thawer: Thawer, index: int, payload: ClassName, current: Any) -> Any:
+        return current if payload.is_name_of(current) else payload.find()
+
+    def copy(self, copier: Copier, obj: type) -> Any:
+        return obj
 
 
 class ClassKind:
@@ -173,12 +236,7 @@ class ClassKind:
                 if thawed is not member:
                     thawer.do_then(type.__setattr__, current, key, thawed)
             return current
-        template = name.cls
-        if template is None:
-            raise SnapshotMismatchError(
-                f"The snapshot is of an environment that uses the class {name.module}.{name.qualname}, which "
-                "is made inside a function; this one has another at its place."
-            )
+        template = name.find()
         # What the class at hand closes over may be another instance's.
         made = thawer.memo[index] = _blank(template, tuple(thawer.thaw(base) for base in bases))
         for key, parts in members:
@@ -204,9 +262,14 @@ def _blank(cls: type, bases: tuple[type, ...]) -> Any:
     namespace["__qualname__"] = cls.__qualname__
     for name in ("__dict__", "__weakref__", "_abc_impl", "__slotnames__"):
         namespace.pop(name, None)
+    # Whose subclasses are abstract keeps a cache in each of its own.
+    is_abstract = isinstance(cls, abc.ABCMeta)
     try:
-        return type.__new__(type(cls), cls.__name__, bases, namespace)
+        made: Any = (abc.ABCMeta if is_abstract else type).__new__(type(cls), cls.__name__, bases, namespace)
     except Exception as error:
         raise SnapshotUnsupportedError(
             f"the class {class_name(cls)} is made inside a function and cannot be made again: {error}"
         ) from error
+    if is_abstract:  # what its methods implement is to follow
+        made.__abstractmethods__ = cls.__abstractmethods__  # type: ignore[attr-defined]
+    return made

@@ -25,7 +25,13 @@ class SequenceKind:
             for place, item in enumerate(items)
         )
         if cls is tuple or cls is frozenset:
-            return cls(thawed)
+            parts = list(thawed)
+            stays = thawer.is_original(index, current) and all(map(operator.is_, current, parts))
+            return current if stays else cls(parts)
+        if thawer.is_original(index, current):
+            thawer.memo[index] = current
+            thawer.do_then(_refill, current, list(thawed))
+            return current
         made: Any = deque(maxlen=maxlen) if cls is deque else cls()
         thawer.memo[index] = made
         if cls is set:
@@ -40,6 +46,23 @@ class SequenceKind:
         made: Any = copier.enter(obj, deque(maxlen=obj.maxlen) if cls is deque else cls())
         (made.update if cls is set else made.extend)([copier.copy(item) for item in obj])
         return made
+
+
+def _refill(container: Any, items: list[Any]) -> None:
+    """Have a list, deque or set hold other items; one that holds them already keeps their order."""
+    if len(container) != len(items) or not all(map(operator.is_, container, items)):
+        container.clear()
+        (container.update if isinstance(container, set) else container.extend)(items)
+
+
+def refill_dict(current: dict[Any, Any], items: dict[Any, Any]) -> None:
+    """Have a dictionary hold other items.
+
+    :param current: the dictionary.
+    :param items: what it shall hold.
+    """
+    current.clear()
+    current.update(items)
 
 
 # Equal objects of these are the same, bit for bit.
@@ -102,13 +125,17 @@ class DictKind:
 
     def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
         made: dict[Any, Any] = {}
-        thawer.memo[index] = made
+        stays = thawer.is_original(index, current)
+        thawer.memo[index] = current if stays else made
         have = current if type(current) is dict else {}
         for key, value in payload:
             thawed_key = thawer.thaw(key)
             thawed = thawer.thaw(value, have.get(thawed_key, MISSING))
             if thawed is not MISSING:
                 made[thawed_key] = thawed
+        if stays:
+            thawer.do_then(refill_dict, current, made)
+            return current
         return made
 
     def copy(self, copier: Copier, obj: dict[Any, Any]) -> Any:

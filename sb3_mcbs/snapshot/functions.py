@@ -20,8 +20,15 @@ def fingerprint(code: types.CodeType) -> tuple[Any, ...]:
 
     :param code: of the function.
     """
-    constants = tuple(fingerprint(c) if isinstance(c, types.CodeType) else repr(c) for c in code.co_consts)
+    constants = tuple(_constant(constant) for constant in code.co_consts)
     return code.co_name, code.co_firstlineno, code.co_code, code.co_names, constants
+
+
+def _constant(value: Any) -> Any:
+    if isinstance(value, types.CodeType):
+        return fingerprint(value)
+    # The order of a set of strings is another in every process.
+    return tuple(sorted(map(repr, value))) if isinstance(value, frozenset) else repr(value)
 
 
 class FunctionName:

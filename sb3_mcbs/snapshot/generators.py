@@ -3,6 +3,7 @@
 import functools
 import random
 import sys
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,29 @@ def is_generator(obj: Any) -> bool:
         return not isinstance(obj, random.SystemRandom)
     torch = sys.modules.get("torch")
     return torch is not None and isinstance(obj, torch.Generator)
+
+
+def global_name(generator: Any) -> str | None:
+    """Name a generator that belongs to the process, as that of ``np.random.normal``; None for others.
+
+    :param generator: the generator.
+    """
+    return next((name for name, find in _GLOBALS.items() if find() is generator), None)
+
+
+def global_generator(name: str) -> Any:
+    """Return a generator that belongs to the process.
+
+    :param name: what :func:`global_name` returned.
+    """
+    return _GLOBALS[name]()
+
+
+_GLOBALS: dict[str, Callable[[], Any]] = {
+    "numpy": lambda: np.random.mtrand._rand,
+    "python": lambda: random._inst,
+    "torch": lambda: getattr(sys.modules.get("torch"), "default_generator", None),
+}
 
 
 def bits_of(generator: Any) -> Any:

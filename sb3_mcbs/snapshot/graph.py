@@ -14,6 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from sb3_mcbs.snapshot.errors import SnapshotError, SnapshotUnsupportedError
+from sb3_mcbs.snapshot.places import Places
 
 #: Stands for "there is nothing at this place".
 MISSING: Any = type("Missing", (), {"__repr__": lambda self: "MISSING"})()
@@ -74,10 +75,20 @@ class Freezer:
     :param kind_of: the kind of an object; None for objects that never change and stand for themselves.
     :param known: id of an object -> the node it is, for objects that are named rather than captured.
     :param n_known: how many nodes those are, the first ones.
+    :param places: names views into simulators.
     """
 
-    def __init__(self, kind_of: Callable[[Any], Kind | None], known: dict[int, Ref], n_known: int) -> None:
+    def __init__(
+        self,
+        kind_of: Callable[[Any], Kind | None],
+        known: dict[int, Ref],
+        n_known: int,
+        places: Places | None = None,
+    ) -> None:
+        self.places = places or Places()
         self.nodes: list[Node] = [("known", None)] * n_known
+        #: The object that each node was made of.
+        self.objects: list[Any] = [None] * n_known
         #: The objects that adapters captured.
         self.adapted: list[Any] = []
         #: The tensors that were captured.
@@ -85,8 +96,8 @@ class Freezer:
         self._kind_of = kind_of
         self._memo = dict(known)
         self._owners: dict[int, Ref] = {}
-        #: What was met. An id is only unique among objects that live, and some on the way are temporary.
-        self.alive: list[Any] = []
+        # An id is only unique among objects that live, and some parts of objects are temporary.
+        self._alive: list[Any] = []
 
     def freeze(self, value: Any) -> Any:
         """Return a frozen value.
@@ -101,7 +112,7 @@ class Freezer:
             return ref
         ref = self._memo[id(value)] = Ref(len(self.nodes))
         self.nodes.append(("pending", None))
-        self.alive.append(value)
+        self.objects.append(value)
         self.nodes[ref.index] = (kind.name, kind.freeze(self, value))
         return ref
 
@@ -114,7 +125,7 @@ class Freezer:
         owner = self._owners.get(id(part))
         if owner is None:
             self._owners[id(part)] = self._memo[id(obj)]
-            self.alive.append(part)
+            self._alive.append(part)
         return owner
 
     def freeze_or_none(self, *values: Any) -> tuple[Any, ...] | None:
@@ -122,16 +133,15 @@ class Freezer:
 
         :param values: any values that an environment holds.
         """
-        n_nodes, n_alive = len(self.nodes), len(self.alive)
-        n_adapted, n_tensors = len(self.adapted), len(self.tensors)
+        n_nodes, n_adapted, n_tensors = len(self.nodes), len(self.adapted), len(self.tensors)
         try:
             return tuple([self.freeze(value) for value in values])
-        except SnapshotUnsupportedError:
-            for obj in self.alive[n_alive:]:
+        except (SnapshotUnsupportedError, RecursionError):
+            for obj in self.objects[n_nodes:]:
                 self._memo.pop(id(obj), None)
             self._owners = {part: ref for part, ref in self._owners.items() if ref.index < n_nodes}
             del self.nodes[n_nodes:]
-            del self.alive[n_alive:]
+            del self.objects[n_nodes:]
             del self.adapted[n_adapted:]
             del self.tensors[n_tensors:]
             return None
@@ -144,12 +154,26 @@ class Thawer:
     :param kinds: kinds by name.
     :param known: the objects that stand for the first nodes, in order.
     :param rng: what happens to random generators: "restore", "keep", or a generator to seed them from.
+    :param originals: the objects that the nodes were made of, if those are to be put back themselves.
+    :param places: finds views into simulators.
     """
 
     def __init__(
-        self, nodes: tuple[Node, ...], kinds: dict[str, Kind], known: list[Any], rng: RngMode
+        self,
+        nodes: tuple[Node, ...],
+        kinds: dict[str, Kind],
+        known: list[Any],
+        rng: RngMode,
+        originals: list[Any] | None = None,
+        places: Places | None = None,
     ) -> None:
         self.rng = rng
+        self.places = places or Places()
+        #: The objects that adapters put back, by the number of their node.
+        self.adapted: dict[int, Any] = {}
+        self._originals = originals
+        #: Whether objects that are there are put back themselves, with the content that they had.
+        self.in_place = originals is not None
         self.memo: dict[int, Any] = dict(enumerate(known))
         self.nodes = nodes
         self._kinds = kinds
@@ -170,6 +194,8 @@ class Thawer:
         if index in self.memo:
             return self.memo[index]
         name, payload = self.nodes[index]
+        if self._originals is not None:
+            current = self._originals[index]
         try:
             thawed = self.memo[index] = self._kinds[name].thaw(self, index, payload, current)
         except SnapshotError:
@@ -177,6 +203,14 @@ class Thawer:
         except Exception as error:
             raise _cannot_be_made(name if current is MISSING else class_name(type(current)), error) from error
         return thawed
+
+    def is_original(self, index: int, current: Any) -> bool:
+        """Return whether an object is the one that a node was made of, and is to stay the one that it is.
+
+        :param index: number of the node.
+        :param current: an object that is there.
+        """
+        return self.in_place and self._originals is not None and current is self._originals[index]
 
     def claim(self, obj: Any) -> bool:
         """Return whether an object may stand for one more node, and note that it now does.

@@ -5,6 +5,7 @@ import enum
 import logging
 import pathlib
 import types
+import weakref
 from collections import deque
 from typing import Any
 
@@ -14,12 +15,20 @@ from gymnasium.envs.registration import EnvSpec, WrapperSpec
 
 from sb3_mcbs.snapshot import generators
 from sb3_mcbs.snapshot.arrays import ArrayKind, BytearrayKind, counterpart
-from sb3_mcbs.snapshot.classes import ClassKind, is_made_per_instance
+from sb3_mcbs.snapshot.classes import ClassKind, LocalClassKind, is_local, is_made_per_instance
 from sb3_mcbs.snapshot.containers import DictKind, SequenceKind
 from sb3_mcbs.snapshot.errors import SnapshotMismatchError
 from sb3_mcbs.snapshot.functions import BuiltinMethodKind, CellKind, FunctionKind, MethodKind
 from sb3_mcbs.snapshot.graph import ATOMIC_CLASSES, MISSING, Copier, Freezer, Kind, Thawer, class_name
-from sb3_mcbs.snapshot.objects import ObjectKind, ReducedKind, is_global, is_ordinary
+from sb3_mcbs.snapshot.objects import (
+    ObjectKind,
+    ReducedKind,
+    copy_content,
+    freeze_content,
+    is_global,
+    is_ordinary,
+    thaw_content,
+)
 from sb3_mcbs.snapshot.randomness import GeneratorKind, SeedsKind, SpaceKind
 from sb3_mcbs.snapshot.registry import SnapshotAdapter, call_on_change, find_adapter
 from sb3_mcbs.snapshot.tensors import TensorKind, is_tensor
@@ -35,8 +44,17 @@ _DRAWING = (
     "gymnasium.envs.mujoco.mujoco_rendering",
     "gymnasium.envs.classic_control.rendering",
 )
+#: Parts of such packages that games keep their state in.
+_DRAWING_NOTHING = ("pygame.rect.", "pygame.math.", "pygame.sprite.")
+#: Classes whose objects hold caches besides what they say themselves that they are made of.
+_SAY_THEMSELVES = ("pandas.",)
 
-_SIMULATOR_PARTS = "mujoco._structs."
+_SIMULATOR_PARTS = (
+    "mujoco._structs.",
+    "dm_control.mujoco.engine.NamedIndexStructs",
+    "dm_control.mujoco.index.FieldIndexer",
+    "dm_control.mujoco.index.make_struct_indexer.",
+)
 _MUJOCO_DRAWING = ("mujoco._structs.Mjv", "mujoco._structs.Mjr")
 
 _ATOMIC_BASES = (np.generic, np.dtype, enum.Enum, pathlib.PurePath)
@@ -55,6 +73,7 @@ _EXACT: dict[type, str] = {
     np.random.SeedSequence: "seeds",
     bytearray: "bytearray",
 }
+_PROXIES = (weakref.ProxyType, weakref.CallableProxyType)
 _CONSTANT_BASES = (types.ModuleType, EnvSpec, WrapperSpec, logging.Logger, logging.LoggerAdapter)
 
 
@@ -87,8 +106,43 @@ class PartKind(ConstantKind):
 
     name = "part"
 
+    def freeze(self, freezer: Freezer, obj: Any) -> Any:
+        return freezer.places.find(obj)
+
+    def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
+        return current if thawer.is_original(index, current) else thawer.places.view_at(payload, current)
+
     def copy(self, copier: Copier, obj: Any) -> Any:
         return counterpart(copier, obj)
+
+
+class ProxyKind:
+    """Weak proxies: what they stand for is held by something else, and captured with that."""
+
+    name = "proxy"
+
+    def freeze(self, freezer: Freezer, obj: Any) -> Any:
+        referent = _referent(obj)
+        return None if referent is MISSING else freezer.freeze(referent)
+
+    def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
+        if payload is None:  # it stood for nothing any more
+            return current
+        have = _referent(current) if type(current) in _PROXIES else MISSING
+        referent = thawer.thaw(payload, have)
+        return current if referent is have or referent is MISSING else weakref.proxy(referent)
+
+    def copy(self, copier: Copier, obj: Any) -> Any:
+        referent = _referent(obj)
+        return obj if referent is MISSING else weakref.proxy(copier.copy(referent))
+
+
+def _referent(proxy: Any) -> Any:
+    """Return what a proxy stands for; ``MISSING`` if that is gone."""
+    try:
+        return proxy.__reduce_ex__.__self__  # a proxy passes on what it is asked for
+    except ReferenceError:
+        return MISSING
 
 
 class AdapterKind:
@@ -100,23 +154,32 @@ class AdapterKind:
         adapter = find_adapter(obj)
         assert adapter is not None
         freezer.adapted.append(obj)
-        return class_name(type(obj)), adapter.capture(obj)
+        state = adapter.capture(obj)
+        content = freeze_content(freezer, obj, adapter.not_state) if adapter.with_attributes else None
+        return class_name(type(obj)), state, content
 
     def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
-        cls, state = payload
+        cls, state, content = payload
         if current is MISSING or class_name(type(current)) != cls:
             here = "nothing" if current is MISSING else f"a {class_name(type(current))}"
             raise SnapshotMismatchError(
                 f"The snapshot holds the state of a {cls}, and this environment has {here} there."
             )
-        plan_adapter(thawer, find_adapter(current), current, state)
+        adapter = find_adapter(current)
+        thawer.adapted[index] = current
+        plan_adapter(thawer, adapter, current, state)
+        if content is not None and adapter is not None:
+            thawer.memo[index] = current
+            thaw_content(thawer, content, current, adapter.not_state)
         return current
 
     def copy(self, copier: Copier, obj: Any) -> Any:
         adapter = find_adapter(obj)
         assert adapter is not None
-        made = adapter.clone(obj, copier.copy)
+        made = copier.enter(obj, adapter.clone(obj, copier.copy))
         copier.adapted.append((adapter, obj, made))
+        if adapter.with_attributes:
+            copy_content(copier, obj, made, adapter.not_state)
         return made
 
 
@@ -144,18 +207,21 @@ def plan_adapter(thawer: Thawer, adapter: SnapshotAdapter | None, obj: Any, stat
 KINDS: dict[str, Kind] = {}
 for _kind_class in (
     ConstantKind, WindowKind, PartKind, ArrayKind, BytearrayKind, TensorKind, SequenceKind, DictKind,
-    GeneratorKind, SeedsKind, SpaceKind, ObjectKind, ReducedKind, AdapterKind,
-    ClassKind, FunctionKind, CellKind, MethodKind, BuiltinMethodKind,
+    GeneratorKind, SeedsKind, SpaceKind, ObjectKind, ReducedKind, ProxyKind, AdapterKind,
+    ClassKind, LocalClassKind, FunctionKind, CellKind, MethodKind, BuiltinMethodKind,
 ):  # fmt: skip
     KINDS[_kind_class.name] = _kind_class()
 
 _kind_by_class: dict[type, Kind | None] = dict.fromkeys(ATOMIC_CLASSES)
-_kind_of_class: dict[type, Kind | None] = {}
+# Classes that are made inside functions come and go, such as those of clones.
+_kind_by_local_class: weakref.WeakKeyDictionary[type, Kind | None] = weakref.WeakKeyDictionary()
+_kind_of_class: weakref.WeakKeyDictionary[type, Kind | None] = weakref.WeakKeyDictionary()
 _UNDECIDED: Any = object()
 
 
 def _forget() -> None:
     _kind_of_class.clear()
+    _kind_by_local_class.clear()
     _kind_by_class.clear()
     _kind_by_class.update(dict.fromkeys(ATOMIC_CLASSES))
 
@@ -175,13 +241,26 @@ def kind_of(obj: Any) -> Kind | None:
     if isinstance(obj, type):  # classes differ from each other
         kind = _kind_of_class.get(obj, _UNDECIDED)
         if kind is _UNDECIDED:
-            kind = _kind_of_class[obj] = KINDS["class"] if is_made_per_instance(obj, kind_of) else None
+            kind = _kind_of_class[obj] = _decide_class(obj)
         return kind
-    kind = _kind_by_class[cls] = _decide(obj, cls)
+    if "<" not in cls.__qualname__:
+        kind = _kind_by_class[cls] = _decide(obj, cls)
+        return kind
+    kind = _kind_by_local_class.get(cls, _UNDECIDED)
+    if kind is _UNDECIDED:
+        kind = _kind_by_local_class[cls] = _decide(obj, cls)
     return kind
 
 
+def _decide_class(cls: type) -> Kind | None:
+    if is_made_per_instance(cls, kind_of):
+        return KINDS["class"]
+    return KINDS["local class"] if is_local(cls) else None
+
+
 def _decide(obj: Any, cls: type) -> Kind | None:
+    if cls in _PROXIES:  # isinstance() takes them for what they stand for
+        return KINDS["proxy"]
     if issubclass(cls, _ATOMIC_BASES) and not issubclass(cls, np.void):
         return None
     if find_adapter(obj) is not None:
@@ -195,7 +274,7 @@ def _decide(obj: Any, cls: type) -> Kind | None:
     name = class_name(cls._type_ if issubclass(cls, ctypes._Pointer) else cls)
     if name.startswith(_SIMULATOR_PARTS):
         return KINDS["constant" if name.startswith(_MUJOCO_DRAWING) else "part"]
-    if any(name.startswith(part + ".") for part in _DRAWING):
+    if any(name.startswith(part + ".") for part in _DRAWING) and not name.startswith(_DRAWING_NOTHING):
         return KINDS["window"]
     if is_tensor(obj):
         return KINDS["torch"]
@@ -203,6 +282,6 @@ def _decide(obj: Any, cls: type) -> Kind | None:
         return KINDS["generator"]
     if issubclass(cls, spaces.Space):
         return KINDS["space"]
-    if is_ordinary(cls):
+    if is_ordinary(cls) and not name.startswith(_SAY_THEMSELVES):
         return KINDS["object"]
     return None if is_global(obj) else KINDS["reduced"]

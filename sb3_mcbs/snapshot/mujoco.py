@@ -7,7 +7,6 @@ model, which environments may edit.
 
 import ctypes
 import operator
-import re
 import weakref
 from collections import OrderedDict
 from collections.abc import Callable
@@ -17,6 +16,7 @@ import mujoco
 import numpy as np
 
 from sb3_mcbs.snapshot.errors import SnapshotMismatchError
+from sb3_mcbs.snapshot.mujoco_views import address, counterpart, place_of, public, view_at
 from sb3_mcbs.snapshot.registry import SnapshotAdapter
 
 #: Textures are most of a model's bytes, and only drawing reads them.
@@ -26,9 +26,6 @@ _MAX_SPARES = 128
 # Sizes that tell a reader most about how two models differ come first in a message.
 _TELLING = ("nq", "nv", "nu", "nbody", "njnt", "ngeom")
 _MAX_SPARE_MODELS = 16
-
-# What a model or its data hand out as objects of their own.
-_PARTS = ("opt", "stat", "vis", "contact", "warning", "timer", "solver")
 
 _BAD_NUMBERS = [
     int(mujoco.mjtWarning.mjWARN_BADQPOS),
@@ -48,7 +45,7 @@ class _ModelLayout:
     """
 
     def __init__(self, model: Any) -> None:
-        values = {name: getattr(model, name) for name in _public(type(model))}
+        values = {name: getattr(model, name) for name in public(type(model))}
         arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
         self.sizes = {name: value for name, value in values.items() if type(value) is int}
         self.names = bytes(model.names)
@@ -59,7 +56,7 @@ class _ModelLayout:
         self.scalars: list[str] = []
         self.vectors: list[str] = []
         for part in ("opt", "stat"):
-            for name in _public(type(getattr(model, part))):
+            for name in public(type(getattr(model, part))):
                 value = getattr(getattr(model, part), name)
                 if isinstance(value, int | float):
                     self.scalars.append(f"{part}.{name}")
@@ -81,18 +78,10 @@ class _ModelLayout:
         return self._read_scalars(model), [vector.tobytes() for vector in self._read_vectors(model)]
 
 
-def _public(cls: type) -> tuple[str, ...]:
-    return tuple(name for name in dir(cls) if not name.startswith("_"))
-
-
-def _address(array: np.ndarray) -> int:
-    return int(array.__array_interface__["data"][0])
-
-
 def _blocks(wanted: list[np.ndarray], arrays: dict[str, np.ndarray], n_buffer: int) -> list[np.ndarray]:
     """Cover arrays that lie in one buffer by few views of bytes."""
-    spans = sorted((_address(array), _address(array) + array.nbytes) for array in wanted if array.nbytes)
-    ends = [(_address(array), _address(array) + array.nbytes) for array in arrays.values() if array.nbytes]
+    spans = sorted((address(array), address(array) + array.nbytes) for array in wanted if array.nbytes)
+    ends = [(address(array), address(array) + array.nbytes) for array in arrays.values() if array.nbytes]
     one_buffer = max(end for _, end in ends) - min(start for start, _ in ends) <= n_buffer
     merged: list[list[int]] = []
     for start, end in spans:
@@ -213,8 +202,14 @@ class MjModelAdapter(SnapshotAdapter):
     def clone(self, obj: Any, copy: Callable[[Any], Any]) -> Any:
         return obj.__copy__()
 
+    def place_of(self, obj: Any, view: Any) -> Any:
+        return place_of(obj, view)
+
+    def view_at(self, obj: Any, place: Any) -> Any:
+        return view_at(obj, place)
+
     def clone_view(self, obj: Any, new: Any, view: Any) -> Any:
-        return _counterpart(obj, new, view)
+        return counterpart(obj, new, view)
 
 
 # Making an MjData takes 100 times as long as copying into one, so those of dropped snapshots are used again.
@@ -338,41 +333,11 @@ class MjDataAdapter(SnapshotAdapter):
 
         return diverged
 
+    def place_of(self, obj: Any, view: Any) -> Any:
+        return place_of(obj, view)
+
+    def view_at(self, obj: Any, place: Any) -> Any:
+        return view_at(obj, place)
+
     def clone_view(self, obj: Any, new: Any, view: Any) -> Any:
-        return _counterpart(obj, new, view)
-
-
-def _counterpart(obj: Any, new: Any, view: Any) -> Any:
-    """Find in ``new`` what ``view`` is in ``obj``: an array, ``model.opt``, ``data.body("torso")``."""
-    if not isinstance(view, np.ndarray):
-        return _counterpart_of_part(obj, new, view)
-    for name in _public(type(obj)):
-        field = getattr(obj, name)
-        if not isinstance(field, np.ndarray) or not np.may_share_memory(field, view):
-            continue
-        memory = getattr(new, name).reshape(-1).view(np.uint8)
-        offset = _address(view) - _address(field)
-        return np.ndarray(view.shape, view.dtype, memory, offset, view.strides)
-    for part in _array_parts(obj):
-        array = operator.attrgetter(part)(obj)
-        if np.may_share_memory(array, view):
-            memory = operator.attrgetter(part)(new).reshape(-1).view(np.uint8)
-            return np.ndarray(view.shape, view.dtype, memory, _address(view) - _address(array), view.strides)
-    return None
-
-
-def _array_parts(obj: Any) -> list[str]:
-    """Name the arrays of a model's options and statistics."""
-    return _layout(obj).vectors if is_model(obj) else []
-
-
-def _counterpart_of_part(obj: Any, new: Any, part: Any) -> Any:
-    accessor = re.fullmatch(r"_Mj(Data|Model)(\w+)Views", type(part).__name__)
-    if accessor is not None:
-        name = accessor[2].lower()
-        found = getattr(obj, name, None)
-        return getattr(new, name)(part.id) if found is not None and found(part.id) is part else None
-    for name in _PARTS:
-        if getattr(obj, name, None) is part:
-            return getattr(new, name)
-    return None
+        return counterpart(obj, new, view)

@@ -1,11 +1,17 @@
 """Objects of Python and of compiled classes."""
 
+import contextlib
 import copyreg
 import ctypes
+import functools
+import gc
+import io
+import types
+from collections import Counter, OrderedDict, defaultdict
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
-from sb3_mcbs.snapshot.containers import freeze_items
+from sb3_mcbs.snapshot.containers import freeze_items, refill_dict
 from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
 from sb3_mcbs.snapshot.graph import MISSING, Copier, Freezer, Ref, Thawer, class_name
 
@@ -16,39 +22,92 @@ class ObjectKind:
     name = "object"
 
     def freeze(self, freezer: Freezer, obj: Any) -> Any:
-        attributes = []
-        for name, value in attributes_of(obj).items():
-            try:
-                attributes.append((name, freezer.freeze(value)))
-            except SnapshotUnsupportedError as error:
-                error.path.insert(0, f".{name}")
-                raise
-        return freezer.freeze(type(obj)), tuple(attributes)
+        return freezer.freeze(type(obj)), freeze_content(freezer, obj)
 
     def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
         cls, attributes = payload
         cls = thawer.thaw(cls, MISSING if current is MISSING else type(current))
-        have = attributes_of(current) if type(current) is cls else {}
-        if _is_value(cls) or type(current) is not cls or not thawer.claim(current):
+        made_anew = _is_value(cls) and not thawer.is_original(index, current)
+        if made_anew or type(current) is not cls or not thawer.claim(current):
+            have = attributes_of(current) if type(current) is cls else {}
             return _made_anew(thawer, index, cls, attributes, have)
         thawer.memo[index] = current
-        values = {}
-        for name, value in attributes:
-            thawed = thawer.thaw(value, have.get(name, MISSING))
-            if thawed is not MISSING:
-                values[name] = thawed
-        thawer.do_then(set_attributes, current, values, set(have).difference(name for name, _ in attributes))
+        thaw_content(thawer, attributes, current)
         return current
 
     def copy(self, copier: Copier, obj: Any) -> Any:
         made = copier.enter(obj, blank(copier.copy(type(obj))))
-        attributes, put = attributes_of(obj), _setter(made)
-        copies = {}
-        for name in sorted(attributes, key=lambda name: not _is_hashed(copier, attributes[name])):
-            copies[name] = copier.copy(attributes[name])
-            put(name, copies[name])
-        _set_in_order(made, {name: copies[name] for name in attributes})
+        copy_content(copier, obj, made)
         return made
+
+
+Attributes = tuple[tuple[str, Any], ...]
+
+
+def freeze_content(freezer: Freezer, obj: Any, leave_out: frozenset[str] = frozenset()) -> Attributes:
+    """Freeze the attributes of an object.
+
+    :param freezer: what freezes them.
+    :param obj: the object.
+    :param leave_out: names of attributes that are not state.
+    :return: names and frozen values.
+    """
+    attributes = []
+    for name, value in attributes_of(obj).items():
+        if name in leave_out:
+            continue
+        try:
+            attributes.append((name, freezer.freeze(value)))
+        except SnapshotUnsupportedError as error:
+            error.path.insert(0, f".{name}")
+            raise
+    return tuple(attributes)
+
+
+def thaw_content(
+    thawer: Thawer, attributes: Attributes, obj: Any, leave_out: frozenset[str] = frozenset()
+) -> None:
+    """Plan to put back the attributes of an object that is there.
+
+    :param thawer: keeps the plan.
+    :param attributes: names and frozen values.
+    :param obj: the object.
+    :param leave_out: names of attributes that stay as they are.
+    """
+    have = attributes_of(obj)
+    values = {}
+    for name, value in attributes:
+        thawed = thawer.thaw(value, have.get(name, MISSING))
+        if thawed is not MISSING:
+            values[name] = thawed
+    gone = set(have).difference(leave_out, [name for name, _ in attributes])
+    thawer.do_then(_set_changed if thawer.in_place else set_attributes, obj, values, gone)
+
+
+def _set_changed(obj: Any, values: dict[str, Any], gone: Iterable[str]) -> None:
+    """Set those attributes that are others by now: some classes do not let theirs be set."""
+    have = attributes_of(obj)
+    set_attributes(
+        obj, {name: value for name, value in values.items() if have.get(name, MISSING) is not value}, gone
+    )
+
+
+def copy_content(copier: Copier, obj: Any, made: Any, leave_out: frozenset[str] = frozenset()) -> None:
+    """Give a new object copies of the attributes of another one.
+
+    :param copier: what copies them.
+    :param obj: the object.
+    :param made: the new object.
+    :param leave_out: names of attributes that ``made`` has already, if it needs them.
+    """
+    attributes, put = attributes_of(obj), _setter(made)
+    copies = {name: value for name, value in attributes_of(made).items() if name in leave_out}
+    names = [name for name in attributes if name not in leave_out]
+    for name in sorted(names, key=lambda name: not _is_hashed(copier, attributes[name])):
+        copies[name] = copier.copy(attributes[name])
+        put(name, copies[name])
+    in_order = dict.fromkeys((*attributes, *copies))
+    _set_in_order(made, {name: copies[name] for name in in_order if name in copies})
 
 
 def blank(cls: type) -> Any:
@@ -109,7 +168,8 @@ def _setter(obj: Any) -> Callable[[str, Any], None]:
 
 def _set_in_order(obj: Any, values: dict[str, Any]) -> None:
     """Set attributes that have been set already, in the order that they shall be listed in."""
-    getattr(obj, "__dict__", {}).clear()
+    if type(obj).__dictoffset__:
+        obj.__dict__.clear()
     set_attributes(obj, values)
 
 
@@ -121,11 +181,11 @@ def attributes_of(obj: Any) -> dict[str, Any]:
     slots = _slots_of(type(obj))
     if not slots and type(obj).__dictoffset__:
         return obj.__dict__
-    attributes = dict(getattr(obj, "__dict__", ()))
+    # Objects that pass on what they do not have would be asked for it by getattr().
+    attributes = dict(obj.__dict__) if type(obj).__dictoffset__ else {}
     for name in slots:
-        value = getattr(obj, name, MISSING)
-        if value is not MISSING:
-            attributes[name] = value
+        with contextlib.suppress(AttributeError):
+            attributes[name] = object.__getattribute__(obj, name)
     return attributes
 
 
@@ -144,7 +204,7 @@ def set_attributes(obj: Any, values: dict[str, Any], gone: Iterable[str] = ()) -
     """
     for name in gone:
         object.__delattr__(obj, name)
-    own = getattr(obj, "__dict__", None)
+    own = obj.__dict__ if type(obj).__dictoffset__ else None
     slots = _slots_of(type(obj))
     if own is not None and not slots:
         own.update(values)
@@ -173,6 +233,17 @@ class ReducedKind:
         )
 
     def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
+        in_place = thawer.in_place
+        # Others may read at once what they are made of, before that is as it was.
+        thawer.in_place = in_place and isinstance(current, _ONLY_REFER)
+        made = self._make(thawer, index, payload, current)
+        thawer.in_place = in_place
+        if thawer.is_original(index, current) and type(current) in _DICTIONARIES:
+            thawer.do_then(refill_dict, current, made)
+            return current
+        return made
+
+    def _make(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
         function, arguments, state, items, pairs, cls = payload
         # What is at its place says what is at the places inside.
         have = _reduced_or_nothing(current) if class_name(type(current)) == cls else _NOTHING_THERE
@@ -206,7 +277,15 @@ class Reduced(NamedTuple):
     pairs: list[Any]
 
 
+_DICTIONARIES = (OrderedDict, defaultdict, Counter)
+_ONLY_REFER = (*_DICTIONARIES, functools.partial, types.MappingProxyType)
 _NOTHING_THERE = Reduced(MISSING, MISSING, MISSING, [], [])
+
+
+#: As ``copyreg.dispatch_table`` has them for pickling.
+_REDUCERS: dict[type, Callable[[Any], Any]] = {
+    types.MappingProxyType: lambda proxy: (types.MappingProxyType, (gc.get_referents(proxy)[0],))
+}
 
 
 def _reduced_or_nothing(obj: Any) -> Reduced:
@@ -220,10 +299,10 @@ def _reduce(obj: Any) -> Reduced:
     """Take an object apart as pickle would."""
     if isinstance(obj, ctypes._SimpleCData | ctypes._Pointer | ctypes._CFuncPtr | ctypes.CDLL):  # type: ignore[attr-defined]
         raise SnapshotUnsupportedError(f"a {class_name(type(obj))} is a handle into compiled code")
-    if hasattr(type(obj), "fileno"):
+    if hasattr(type(obj), "fileno") and not isinstance(obj, io.BytesIO | io.StringIO):
         raise SnapshotUnsupportedError(f"a {class_name(type(obj))} is an open file, socket or pipe")
     try:
-        reducer = copyreg.dispatch_table.get(type(obj))
+        reducer = _REDUCERS.get(type(obj)) or copyreg.dispatch_table.get(type(obj))
         reduced = reducer(obj) if reducer else obj.__reduce_ex__(4)
     except Exception as error:
         raise SnapshotUnsupportedError(f"its class is {class_name(type(obj))} and {error}") from error

@@ -9,13 +9,18 @@ from sb3_mcbs.snapshot import generators
 from sb3_mcbs.snapshot.graph import MISSING, Copier, Freezer, Ref, Thawer
 from sb3_mcbs.snapshot.spaces import definition_of, is_defined_as, made_of, parts_of
 
+_GLOBAL = "global"
+
 
 class GeneratorKind:
-    """Random generators, with the sequences that they spawn from."""
+    """Random generators, with the sequences that they spawn from. Those of the process are no state."""
 
     name = "generator"
 
     def freeze(self, freezer: Freezer, obj: Any) -> Any:
+        global_name = generators.global_name(obj)
+        if global_name is not None:
+            return _GLOBAL, global_name, None, None
         bits = generators.bits_of(obj)
         classes = type(obj), type(bits)
         kind = generators.kind_of(classes)
@@ -26,6 +31,8 @@ class GeneratorKind:
 
     def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
         kind, classes, state, seeds = payload
+        if kind == _GLOBAL:
+            return generators.global_generator(classes)
         if not generators.is_of_kind(current, kind):
             current = MISSING
         if type(state) is Ref:
@@ -53,6 +60,8 @@ class GeneratorKind:
         return generator
 
     def copy(self, copier: Copier, obj: Any) -> Any:
+        if generators.global_name(obj) is not None:
+            return obj
         bits = generators.bits_of(obj)
         if bits is not obj:
             return type(obj)(copier.copy(bits))

@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any
+from weakref import WeakKeyDictionary
 
 
 class SnapshotAdapter(ABC):
@@ -11,14 +12,20 @@ class SnapshotAdapter(ABC):
     The object may be a simulator that an environment holds in an attribute, or the environment (or
     a wrapper) itself.
 
-    :cvar with_attributes: for an adapter of whole environments or wrappers: whether their Python
-        attributes are captured besides what :meth:`capture` returns. They are put back after
-        :meth:`restore` has run; attributes that cannot be captured are then the adapter's business.
+    :cvar with_attributes: whether the object's Python attributes are captured besides what :meth:`capture`
+        returns. They are put back after :meth:`restore` has run, and a clone is given copies of them after
+        :meth:`clone`. Those of an environment or wrapper that cannot be captured are the adapter's business;
+        those of another object are refused, unless ``not_state`` names them.
     :cvar not_state: names of attributes that are neither captured nor put back.
+    :cvar n_later_checks: for an adapter of whole environments: from how many states, farther and farther
+        from the reset, the check before the first snapshot compares steps.
+    :cvar advice: what a user can do about an environment that does not pass this check.
     """
 
     with_attributes: bool = False
     not_state: frozenset[str] = frozenset()
+    n_later_checks: int = 1
+    advice: str = ""
 
     def attach(self, env: Any) -> None:  # noqa: B027
         """Prepare an environment; called when it is wrapped in ``SnapshotEnvWrapper``.
@@ -72,6 +79,14 @@ class SnapshotAdapter(ABC):
         :param seed: non-negative, below 2**63.
         """
 
+    def fall_back(self, env: Any) -> bool:
+        """Capture an environment another way from now on: it did not pass the check.
+
+        :param env: the environment, which is then checked again.
+        :return: False if there is no other way.
+        """
+        return False
+
     def watch(self, obj: Any) -> Callable[[], bool] | None:
         """Give a function that says whether a simulator gave up its state by itself.
 
@@ -84,6 +99,24 @@ class SnapshotAdapter(ABC):
         """
         return None
 
+    def place_of(self, obj: Any, view: Any) -> Any:
+        """Say where in an object a view into it lies, so that a restore puts back which view was held.
+
+        :param obj: the object.
+        :param view: an array whose memory belongs to something that is not an array, or another object that
+            a simulator hands out.
+        :return: the place, picklable and equal for equal places; None if it is not a view into ``obj``.
+        """
+        return None
+
+    def view_at(self, obj: Any, place: Any) -> Any:
+        """Return the view that lies at a place.
+
+        :param obj: the object, or its counterpart in another instance of the environment.
+        :param place: what :meth:`place_of` returned.
+        """
+        raise NotImplementedError(f"{type(self).__name__} names places of views, and cannot find them")
+
     def clone_view(self, obj: Any, new: Any, view: Any) -> Any:
         """Find in a cloned object what corresponds to a view into the original.
 
@@ -93,13 +126,14 @@ class SnapshotAdapter(ABC):
             a simulator hands out.
         :return: the corresponding view into ``new``, or None if it is not a view into ``obj``.
         """
-        return None
+        place = self.place_of(obj, view)
+        return None if place is None else self.view_at(new, place)
 
 
 Predicate = Callable[[Any], bool]
 
 _registered: list[tuple[Predicate, SnapshotAdapter]] = []
-_by_class: dict[type, SnapshotAdapter | None] = {}
+_by_class: WeakKeyDictionary[type, SnapshotAdapter | None] = WeakKeyDictionary()
 _on_change: list[Callable[[], None]] = []
 
 

@@ -192,16 +192,17 @@ def _recorder(env: Any) -> Recorder | None:
     return vars(env).get(RECORDER)
 
 
-def _constructor_arguments(env: Any) -> inspect.BoundArguments:
+def _constructor_arguments(env: Any, what: str = "is restored by replay") -> inspect.BoundArguments:
     """Find the arguments that make another environment like this one, which draws nothing.
 
+    :param what: what is done with the environment, for the error.
     :raises SnapshotUnsupportedError: if they cannot be found out.
     """
     signature = inspect.signature(type(env))
     try:
         bound = _bind(env, signature)
     except TypeError as error:
-        raise _unknown_arguments(env, str(error)) from error
+        raise _unknown_arguments(env, what, str(error)) from error
     for name, value in bound.arguments.items():
         if name == "render_mode":
             bound.arguments[name] = None
@@ -243,10 +244,10 @@ def _maker(entry_point: Any) -> Any:
     return entry_point if callable(entry_point) else load_env_creator(entry_point)
 
 
-def _unknown_arguments(env: Any, reason: str) -> SnapshotUnsupportedError:
+def _unknown_arguments(env: Any, what: str, reason: str) -> SnapshotUnsupportedError:
     name = type(env).__name__
     return SnapshotUnsupportedError(
-        f"{name} is restored by replay, and for clones the arguments of its constructor must be known: "
+        f"{name} {what}, and for clones the arguments of its constructor must be known: "
         f"{reason}. Register {name} and use gymnasium.make, or derive it from gymnasium.utils.EzPickle and "
         "end its __init__ with EzPickle.__init__(self, <the same arguments>)."
     )

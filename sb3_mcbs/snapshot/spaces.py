@@ -2,6 +2,7 @@
 
 import operator
 import weakref
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -169,6 +170,20 @@ def _made(value: Any) -> Any:
     if form == "other":
         return None
     return _CONTAINERS[form](_made(item) for item in content)
+
+
+def values_of(observation: Any) -> Iterator[np.ndarray]:
+    """Go through the arrays that an observation consists of; those of spaces in spaces, too.
+
+    :param observation: an array, a plain value, or dicts, tuples and lists of them.
+    """
+    if isinstance(observation, dict):
+        observation = tuple(observation.values())
+    if isinstance(observation, tuple | list):
+        for part in observation:
+            yield from values_of(part)
+    else:
+        yield np.asarray(observation)
 
 
 def random_action(space: Any, rng: np.random.Generator) -> np.ndarray:

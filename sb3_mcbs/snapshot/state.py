@@ -15,6 +15,7 @@ from sb3_mcbs.snapshot.graph import Copier, Freezer, Node, Ref, RngMode, Thawer
 from sb3_mcbs.snapshot.kinds import KINDS, kind_of, plan_adapter
 from sb3_mcbs.snapshot.layers import Layer, layers_of
 from sb3_mcbs.snapshot.objects import attributes_of, blank, set_attributes
+from sb3_mcbs.snapshot.places import Places
 from sb3_mcbs.snapshot.registry import SnapshotAdapter, find_adapter
 from sb3_mcbs.snapshot.tensors import check_memory
 
@@ -37,6 +38,19 @@ class FrozenLayer(NamedTuple):
     adapted: tuple[Any] | None
     attributes: dict[str, Any] | None
     cls: Any
+
+
+class Kept(NamedTuple):
+    """A captured state, and the very objects that it was captured of.
+
+    :param layers: the captured layers.
+    :param nodes: the nodes that their values refer to.
+    :param objects: what each node was made of.
+    """
+
+    layers: tuple[FrozenLayer, ...]
+    nodes: tuple[Node, ...]
+    objects: list[Any]
 
 
 class Stack:
@@ -72,6 +86,16 @@ class Stack:
         for layer in self.layers:
             self._refs[id(layer.env)] = Ref(place)
             place += not layer.recorder
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether the owner still wraps these layers, and no others."""
+        env: Any = self._owner
+        for layer in self.layers:
+            env = env.env
+            if env is not layer.env:
+                return False
+        return True
 
     @contextlib.contextmanager
     def bare(self) -> Iterator[gym.Env[Any, Any]]:
@@ -112,11 +136,33 @@ class Stack:
         :return: the captured layers, outermost first, and the nodes that their values refer to.
         :raises SnapshotUnsupportedError: if a layer holds something that cannot be captured.
         """
-        freezer = Freezer(kind_of, self._refs, len(self._stateful))
-        frozen = tuple([self._freeze_layer(freezer, layer, monitor) for layer in self._stateful])
+        kept = self.keep(monitor)
+        return kept.layers, kept.nodes
+
+    def keep(self, monitor: bool) -> Kept:
+        """Capture the state, for :meth:`put_back`.
+
+        :param monitor: whether what a ``Monitor`` holds is captured.
+        :raises SnapshotUnsupportedError: if a layer holds something that cannot be captured.
+        """
+        while True:
+            freezer = Freezer(kind_of, self._refs, len(self._stateful), Places(self._watched or ()))
+            frozen = tuple([self._freeze_layer(freezer, layer, monitor) for layer in self._stateful])
+            self._watch(freezer.adapted)
+            if freezer.places.are_of(freezer.adapted):
+                break
         check_memory(freezer)
-        self._watch(freezer.adapted)
-        return frozen, tuple(freezer.nodes)
+        return Kept(frozen, tuple(freezer.nodes), freezer.objects)
+
+    def put_back(self, kept: Kept) -> None:
+        """Put the layers into a captured state, with the objects that they held then.
+
+        Somebody else may hold those, too: settings that several environments share, a model.
+
+        :param kept: of :meth:`keep`.
+        """
+        self._thaw(kept.layers, kept.nodes, "restore", kept.objects)
+        self.find_simulators()
 
     def find_simulators(self) -> None:
         """Watch the simulators that are there now: a reset of the environment may exchange its own."""
@@ -190,12 +236,31 @@ class Stack:
         :param rng: what becomes of random generators.
         :raises SnapshotMismatchError: if the state does not fit; nothing has been changed then.
         """
+        self._thaw(frozen, nodes, rng, None)
+
+    def _thaw(
+        self,
+        frozen: tuple[FrozenLayer, ...],
+        nodes: tuple[Node, ...],
+        rng: RngMode,
+        originals: list[Any] | None,
+    ) -> None:
         layers = self._pair(frozen)
         known = [layer.env if layer is not None else None for layer in layers]
         for place in reversed(range(len(known) - 1)):
             if known[place] is None:
                 known[place] = known[place + 1]
-        thawer = Thawer(nodes, KINDS, known, rng)
+        places = Places(self._watched or ())
+        while True:
+            thawer = Thawer(nodes, KINDS, known, rng, originals, places)
+            self._plan(thawer, layers, frozen)
+            simulators = [thawer.adapted[index] for index in sorted(thawer.adapted)]
+            if places.are_of(simulators):
+                break
+            places = Places(simulators)
+        thawer.commit()
+
+    def _plan(self, thawer: Thawer, layers: list[Layer | None], frozen: tuple[FrozenLayer, ...]) -> None:
         for layer, captured in zip(layers, frozen, strict=True):
             if layer is None:
                 continue
@@ -205,7 +270,6 @@ class Stack:
             thawer.thaw(captured.cls, type(layer.env))
             if captured.attributes is not None:
                 thaw_attributes(thawer, layer.env, layer.not_state, captured.attributes, adapter is None)
-        thawer.commit()
 
     def _pair(self, frozen: tuple[FrozenLayer, ...]) -> list[Layer | None]:
         """Find for each captured layer the one to restore; None for a Monitor that is not there."""

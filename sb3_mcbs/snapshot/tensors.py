@@ -43,8 +43,14 @@ class TensorKind:
     def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
         content, layout, grad = payload
         if type(content) is Ref:
-            made = _tensor(thawer.thaw(content).untyped_storage(), layout)
-        elif _can_be_put_back(current, layout, content) and thawer.claim(current):
+            storage = thawer.thaw(content).untyped_storage()
+            stays = thawer.is_original(index, current) and current.untyped_storage() is storage
+            made = current if stays else _tensor(storage, layout)
+        elif (
+            (layout[0] or thawer.is_original(index, current))
+            and _can_be_put_back(current, layout, content)
+            and thawer.claim(current)
+        ):
             made = current
             thawer.do_then(_write, current, content)
         else:
@@ -86,7 +92,7 @@ def check_memory(freezer: Freezer) -> None:
     :raises SnapshotUnsupportedError: if there is one.
     """
     spans = [_span(tensor.untyped_storage()) for tensor in freezer.tensors if tensor.device.type == "cpu"]
-    for array in freezer.alive if spans else ():
+    for array in freezer.objects if spans else ():
         if type(array) is np.ndarray and array.base is None and array.nbytes:
             start = int(array.__array_interface__["data"][0])
             if any(start < end and its_start < start + array.nbytes for its_start, end in spans):
@@ -110,7 +116,7 @@ def _layout(tensor: Any) -> tuple[Any, ...]:
 
 
 def _can_be_put_back(current: Any, layout: tuple[Any, ...], content: np.ndarray) -> bool:
-    if not layout[0] or not is_tensor(current) or _layout(current) != layout:
+    if not is_tensor(current) or _layout(current) != layout:
         return False
     return current.untyped_storage().nbytes() == content.nbytes
 

@@ -7,26 +7,29 @@ says so. So its first steps are compared, bit by bit.
 
 import copy
 import logging
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple, Protocol
-from weakref import WeakKeyDictionary
+from weakref import WeakKeyDictionary, ref
 
 import gymnasium as gym
 import numpy as np
 
-from sb3_mcbs.snapshot.errors import SnapshotError, SnapshotUnsupportedError
+from sb3_mcbs.snapshot.errors import SnapshotError, SnapshotMismatchError, SnapshotUnsupportedError
 from sb3_mcbs.snapshot.global_generators import globals_kept, seed_globals
 from sb3_mcbs.snapshot.graph import private_copy
 from sb3_mcbs.snapshot.layers import Layer, replaced_method
 from sb3_mcbs.snapshot.objects import attributes_of
-from sb3_mcbs.snapshot.registry import find_adapter
+from sb3_mcbs.snapshot.registry import SnapshotAdapter, find_adapter
 from sb3_mcbs.snapshot.spaces import random_action
 
 logger = logging.getLogger("sb3_mcbs")
 
 #: Steps before the first snapshot, in each run that is compared, and before the second snapshot.
 WARM_UP, STEPS, BETWEEN = 3, 8, 6
+#: How often other actions are tried if an environment takes the first one for an error.
+TRIES = 10
 
 _KNOWN_ENVIRONMENTS = tuple(
     f"gymnasium.envs.{part}." for part in ("mujoco", "classic_control", "box2d", "toy_text")
@@ -42,15 +45,38 @@ _CALLING_WRAPPERS = {
     )
 }
 
-_WHAT_TO_DO = (
+_NOT_SEEN = (
     "State outside of Python objects, in globals or in class attributes cannot be seen. Say how it is "
     "captured with sb3_mcbs.snapshot.register_adapter(...); if the environment always does the same from the "
-    "same seed, with a ReplayAdapter(). Without exact copies there are forward_model='ensemble', which "
-    "learns a model, and rollout_depth=0. SnapshotEnvWrapper(env, verify=False) leaves out this check."
+    "same seed, with a ReplayAdapter()."
+)
+_WITHOUT = (
+    "Without exact copies there are forward_model='ensemble', which learns a model, and rollout_depth=0. "
+    "SnapshotEnvWrapper(env, verify=False) leaves out this check."
+)
+_USES_BULLET = (
+    "PyBullet is imported: if {0} uses it, capture it with register_adapter("
+    'lambda env: isinstance(env, {0}), BulletAdapter(client="<attribute that holds the server\'s handle>")).'
 )
 
 #: Which environments passed: by the class of the innermost, how it was made and what is around it.
 _passed: "WeakKeyDictionary[type, set[Any]]" = WeakKeyDictionary()
+
+
+class CannotResetError(SnapshotUnsupportedError):
+    """An environment cannot be reset for the check, as it may need ``options``."""
+
+
+class InexactError(SnapshotUnsupportedError):
+    """An environment does not do the same after a restore, or in a clone.
+
+    :param what: what differed.
+    :param what_to_do: about it.
+    """
+
+    def __init__(self, what: str, what_to_do: str) -> None:
+        super().__init__(f"{what} {what_to_do}")
+        self.what = what
 
 
 class Checked(Protocol):
@@ -66,7 +92,10 @@ class Checked(Protocol):
         """Return an independent copy in the present state."""
 
     def reset(self) -> None:
-        """Reset it, always with the same seed."""
+        """Reset it, always with the same seed.
+
+        :raises CannotResetError: if that raised anything.
+        """
 
     def step(self, action: Any) -> Any:
         """Step it."""
@@ -76,13 +105,14 @@ class Checked(Protocol):
 
 
 class Outcome(NamedTuple):
-    """What one step gave; ``raised`` says what it raised instead."""
+    """What one step gave; ``raised`` names the class of what it raised instead, ``error`` all of it."""
 
     observation: Any = None
     reward: Any = None
     terminated: Any = None
     truncated: Any = None
     raised: str | None = None
+    error: str = ""
 
     @property
     def ends(self) -> bool:
@@ -118,9 +148,18 @@ def has_passed(layers: Sequence[Layer]) -> bool:
 
 def _fingerprint(layers: Sequence[Layer]) -> Any:
     base = layers[-1].env
-    made = None if base.spec is None else (base.spec.id, repr(base.spec.kwargs))
-    holds = tuple((name, type(value)) for name, value in attributes_of(base).items() if name != "_np_random")
-    return made, holds, tuple(type(layer.env) for layer in layers)
+    made = None if base.spec is None else (base.spec.id, _text(base.spec.kwargs))
+    attributes = attributes_of(base).items()
+    # Classes that are made inside functions shall not live on for this.
+    holds = frozenset((name, ref(type(value))) for name, value in attributes if name != "_np_random")
+    return made, holds, tuple(ref(type(layer.env)) for layer in layers)
+
+
+def _text(value: Any) -> Any:
+    try:
+        return repr(value)
+    except Exception:  # whoever has no text is like no other
+        return object()
 
 
 def check_exact(checked: Checked, layers: Sequence[Layer], action_space: gym.Space) -> None:
@@ -135,17 +174,47 @@ def check_exact(checked: Checked, layers: Sequence[Layer], action_space: gym.Spa
     """
     start = time.perf_counter()
     name = type(layers[-1].env).__name__
+    as_it_came = _fingerprint(layers)
     with globals_kept():
-        n_steps = _Check(checked, name, action_space).run()
-    _passed.setdefault(type(layers[-1].env), set()).add(_fingerprint(layers))
+        n_steps = _check(checked, layers[-1].env, action_space)
+    # A reset may have given it more attributes, as it may have done with the next one.
+    _passed.setdefault(type(layers[-1].env), set()).update((as_it_came, _fingerprint(layers)))
     seconds = time.perf_counter() - start
     logger.info("snapshots of %s were checked: exact in %d steps (%.2f s)", name, n_steps, seconds)
 
 
+def _check(checked: Checked, env: Any, action_space: gym.Space) -> int:
+    """Check an environment, and again if its adapter knows another way to capture it.
+
+    :return: how many steps the comparisons took.
+    """
+    adapter = find_adapter(env)
+    try:
+        return _Check(checked, env, action_space, adapter).run()
+    except (InexactError, SnapshotMismatchError) as error:
+        if adapter is None or not adapter.fall_back(env):
+            if isinstance(error, InexactError):
+                raise
+            raise SnapshotUnsupportedError(str(error)) from error
+        first = error.what if isinstance(error, InexactError) else str(error)
+        logger.info("%s It is captured another way.", first)
+    try:
+        return _Check(checked, env, action_space, adapter).run()
+    except SnapshotError as error:
+        raise SnapshotUnsupportedError(f"{first} Captured another way: {error}") from error
+
+
 class _Check:
-    def __init__(self, checked: Checked, name: str, action_space: gym.Space) -> None:
+    def __init__(
+        self, checked: Checked, env: Any, action_space: gym.Space, adapter: SnapshotAdapter | None
+    ) -> None:
         self._env = checked
-        self._name = name
+        self._name = type(env).__name__
+        self._n_later = 1 if adapter is None else adapter.n_later_checks
+        advice = _NOT_SEEN if adapter is None else adapter.advice or _NOT_SEEN
+        if adapter is None and "pybullet" in sys.modules:
+            advice = f"{_USES_BULLET.format(self._name)} {advice}"
+        self._what_to_do = f"{advice} {_WITHOUT}"
         self._sample = _sampler(action_space)
         self._n_steps = 0
 
@@ -156,19 +225,37 @@ class _Check:
         """
         if any(outcome.ends for outcome in self._reset(WARM_UP)):
             self._reset(0)
-        actions, state = self._draw(STEPS), self._env.capture()
-        expected = self._steps(self._env, actions)
+        state = self._env.capture()
+        actions, expected = self._first_run(state)
         self._env.put_back(state)
         self._compare(expected, self._steps(self._env, actions), "After a restore", self._repeats)
         self._env.put_back(state)
         copy_of_env = self._env.copy()
         try:
             self._check_copy(copy_of_env, actions, state, expected)
-            if not expected[-1].ends and not any(o.ends for o in self._steps(self._env, self._draw(BETWEEN))):
-                self._check_later(copy_of_env)
+            ended = expected[-1].ends
+            for _ in range(self._n_later):
+                ended = ended or any(o.ends for o in self._steps(self._env, self._draw(BETWEEN)))
+                if ended and self._n_later > 1:
+                    ended = any(outcome.ends for outcome in self._reset(0))
+                if not ended:
+                    ended = self._check_later(copy_of_env)
         finally:
             copy_of_env.close()
         return self._n_steps
+
+    def _first_run(self, state: Any) -> tuple[list[Any], list[Outcome]]:
+        """Take steps from a state, with actions of which the environment takes the first one at least."""
+        for _ in range(TRIES):
+            actions = self._draw(STEPS)
+            expected = self._steps(self._env, actions)
+            if not expected[0].raised:
+                return actions, expected
+            self._env.put_back(state)
+        raise SnapshotUnsupportedError(
+            f"The snapshots of {self._name} could not be checked: its step raised {expected[0].error}. "
+            "SnapshotEnvWrapper(env, verify=False) leaves out the check."
+        )
 
     def _check_copy(
         self, copy_of_env: Checked, actions: list[Any], state: Any, expected: list[Outcome]
@@ -185,13 +272,14 @@ class _Check:
         copy_of_env.put_back(state)
         self._compare(expected, self._steps(copy_of_env, actions), "In a clone after a restore")
 
-    def _check_later(self, copy_of_env: Checked) -> None:
-        """The same from a state that is farther from the reset."""
+    def _check_later(self, copy_of_env: Checked) -> bool:
+        """The same from a state that is farther from the reset. Return whether the episode ended."""
         actions, state = self._draw(STEPS), self._env.capture()
         expected = self._steps(self._env, actions)
         for env, where in ((self._env, "After a restore"), (copy_of_env, "In a clone after a restore")):
             env.put_back(state)
             self._compare(expected, self._steps(env, actions), f"{where} farther from the reset")
+        return expected[-1].ends
 
     def _draw(self, n: int) -> list[Any]:
         return [self._sample() for _ in range(n)]
@@ -212,7 +300,8 @@ class _Check:
             except SnapshotError:
                 raise
             except Exception as error:
-                outcome = Outcome(raised=f"{type(error).__name__}: {error}")
+                name = type(error).__name__
+                outcome = Outcome(raised=name, error=f"{name}: {error}")
             outcomes.append(outcome)
             if outcome.ends:
                 break
@@ -235,22 +324,17 @@ class _Check:
         repeats: Callable[[list[Any]], bool] | None = None,
         first: int = 0,
     ) -> None:
-        if expected[0].raised:
-            raise SnapshotUnsupportedError(
-                f"The snapshots of {self._name} could not be checked: its step raised {expected[0].raised}. "
-                "SnapshotEnvWrapper(env, verify=False) leaves out the check."
-            )
         difference = _first_difference(expected, seen)
         if difference is None:
             return
         step, what = difference
-        reason = f"{where} step {first + step + 1} of {self._name} gave {what}."
+        reason = f"{where} step {first + step + 1} of {self._name} {what}."
         if repeats is not None and not repeats(self._draw(STEPS)):
             reason += (
                 " It does not repeat itself after two resets with the same seed either: it draws random "
                 "numbers that no generator of its own gives, or remembers earlier episodes somewhere else."
             )
-        raise SnapshotUnsupportedError(f"{reason} {_WHAT_TO_DO}")
+        raise InexactError(reason, self._what_to_do)
 
 
 def _sampler(space: gym.Space) -> Callable[[], Any]:
@@ -268,12 +352,12 @@ def _first_difference(expected: list[Outcome], seen: list[Outcome]) -> tuple[int
     :return: its number, and what differed in words; None if nothing did.
     """
     for step, (one, other) in enumerate(zip(expected, seen, strict=False)):
-        for name in Outcome._fields:
+        if one.raised != other.raised:
+            return step, f"raised {other.error}" if other.raised else f"did not raise {one.error}"
+        for name in ("observation", "reward", "terminated", "truncated"):
             for path, value, its in _leaves(getattr(one, name), getattr(other, name), name):
                 if not _is_same(value, its):
-                    return step, _in_words(path, value, its)
-    if len(expected) != len(seen):
-        return min(len(expected), len(seen)), "no result, or one where there was none"
+                    return step, f"gave {_in_words(path, value, its)}"
     return None
 
 

@@ -14,7 +14,7 @@ from sb3_mcbs.snapshot.graph import Node, RngMode, private_copy
 from sb3_mcbs.snapshot.layers import describe_space
 from sb3_mcbs.snapshot.replay import Box2DAdapter
 from sb3_mcbs.snapshot.state import FrozenLayer, Stack
-from sb3_mcbs.snapshot.verification import check_exact, has_passed, is_known_exact
+from sb3_mcbs.snapshot.verification import CannotResetError, check_exact, has_passed, is_known_exact
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,9 +88,11 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
         self.last_observation = None
         self.moment = (0, 0)
         self.reset_arguments = {"seed": None, "options": None}
-        self._stack = Stack(self)
-        self.verifies = verify
-        self._verified = not verify
+        self._known_stack: Stack | None = Stack(self)
+        # One below may say so, and be below a Monitor by now.
+        below = [layer.env for layer in self._stack.layers if isinstance(layer.env, SnapshotEnvWrapper)]
+        self.verifies = verify and all(wrapper.verifies for wrapper in below)
+        self._verified = not self.verifies
         self._spaces = (describe_space(self.observation_space), describe_space(self.action_space))
         # Whatever cannot be captured is better known before training than in the middle of it.
         self._stack.freeze()
@@ -103,6 +105,21 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
             super().__setattr__(name, value)
         else:
             setattr(self.env, name, value)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # It knows the layers by their identity, which a copy does not share.
+        return {name: value for name, value in vars(self).items() if name != "_known_stack"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        vars(self)["_known_stack"] = None
+
+    @property
+    def _stack(self) -> Stack:
+        stack = self._known_stack
+        if stack is None or not stack.is_whole:  # a wrapper may have exchanged what it wraps
+            stack = self._known_stack = Stack(self)
+        return stack
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -123,36 +140,40 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
         self._stack.find_simulators()
         return observation, info
 
-    def verify(self) -> None:
+    def verify(self) -> bool:
         """Check that snapshots of this environment are exact, if that is not known already.
 
         The environment is then as it was, in the middle of an episode, too. Neither a ``Monitor`` nor global
         generators notice.
 
+        :return: False if it has never been reset and a reset with a seed alone fails: it is checked later.
         :raises SnapshotUnsupportedError: if part of it cannot be captured, or it does not do the same after a
             restore or in a clone. It is reset then, as it was reset last.
         """
         if self._verified:
-            return
+            return True
         layers = self._stack.layers
         if not is_known_exact(layers, (Box2DAdapter,)) and not has_passed(layers):
             try:
                 self._check()
-            except SnapshotUnsupportedError:
+            except SnapshotError as error:
+                if isinstance(error, CannotResetError) and self.last_observation is None:
+                    return False
                 with contextlib.suppress(Exception):  # the error that is raised says more
                     self.reset(**private_copy(self.reset_arguments))
                 raise
         self._verified = True
+        return True
 
     def _check(self) -> None:
         stack = self._stack
-        layers, nodes = stack.freeze(monitor=False)
+        kept = stack.keep(monitor=False)
         with stack.bare() as bare:
-            checked = _CheckedEnvironment(stack, bare, self.reset_arguments)
             try:
+                checked = _CheckedEnvironment(stack, bare, self.reset_arguments)
                 check_exact(checked, stack.layers, self.action_space)
             finally:
-                checked.put_back((layers, nodes))
+                stack.put_back(kept)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Step the environment.
@@ -281,7 +302,14 @@ class _CheckedEnvironment:
 
     def reset(self) -> None:
         arguments = private_copy(self._reset_arguments)
-        self._env.reset(seed=arguments["seed"] or 0, options=arguments["options"])
+        try:
+            self._env.reset(seed=arguments["seed"] or 0, options=arguments["options"])
+        except Exception as error:
+            raise CannotResetError(
+                f"The snapshots of {type(self._env.unwrapped).__name__} could not be checked: its reset "
+                f"raised {type(error).__name__}: {error}. SnapshotEnvWrapper(env, verify=False) leaves out "
+                "the check."
+            ) from error
 
     def step(self, action: Any) -> Any:
         return self._env.step(action)
