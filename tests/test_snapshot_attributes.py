@@ -1,10 +1,14 @@
 """Attributes of layers: those that are set from outside, and those that an adapter leaves alone."""
 
+import copy
+
 import gymnasium as gym
+import numpy as np
 import pytest
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_mcbs.snapshot import ReplayAdapter, SnapshotEnvWrapper, register_adapter
+from tests.test_snapshot_graph import Small
 from tests.test_snapshot_state import Toy, Unseen, follow
 
 
@@ -53,6 +57,21 @@ def test_attributes_that_a_replay_leaves_alone(own_adapters):
         target.restore(state)
         assert (target.unwrapped.note, target.unwrapped.mark) == ("now", 2)
         assert follow(target) == expected
+
+
+def test_a_deep_copy_records_for_itself(own_adapters):
+    class Steady(Small):
+        pass
+
+    register_adapter(lambda obj: isinstance(obj, Steady), ReplayAdapter())
+    env = SnapshotEnvWrapper(Steady(), verify=False)
+    env.reset(seed=0)
+    env.step(np.zeros(1))
+    made = copy.deepcopy(env)
+    assert [float(made.step(np.zeros(1))[0][0]) for _ in range(2)] == [2, 3]
+    assert env.unwrapped.total == 1 and float(env.step(np.zeros(1))[0][0]) == 2
+    for target, n_steps in ((env, 2), (made, 3)):
+        assert len(target.snapshot().layers[0].adapted[0].actions) == n_steps
 
 
 class Curriculum(gym.Wrapper):

@@ -128,11 +128,11 @@ class NoShape(Walk):
 
 class Market(Walk):
     def prepare(self):
-        self.prices = pd.DataFrame({"open": np.arange(50.0), "name": "a"})
+        self.prices, self.news = pd.DataFrame({"open": np.arange(50.0), "name": "a"}), iter([*range(99)])
 
     def push(self):
-        self.prices.loc[self.age % 50, "open"] += 1
-        return float(self.prices["open"].iloc[: self.age].sum())
+        self.prices["open"] = self.prices["open"] + 1
+        return float(self.prices["open"].iloc[: self.age].sum()) + next(self.news)
 
 
 STACKED = {

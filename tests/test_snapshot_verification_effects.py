@@ -18,6 +18,7 @@ from stable_baselines3.common.monitor import Monitor
 from sb3_mcbs import MCBSTD3, SearchPolicy
 from sb3_mcbs.snapshot import SnapshotEnvWrapper, SnapshotUnsupportedError
 from tests.conftest import SMALL
+from tests.test_snapshot_graph import Cell
 from tests.test_snapshot_verification import EXACT, STEPS, Handle, Walk, follow
 
 DRAWN = [0]
@@ -66,7 +67,7 @@ def test_objects_that_others_hold_too_stay_the_same_objects():
         def __init__(self, *held):
             super().__init__()
             self.settings, self.rows, self.array, self.ordered, self.seen, self.objects = held
-            self.view, self.tensor = self.array[1:], th.zeros(2)
+            self.view, self.tensor, self.cell = self.array[1:], th.zeros(2), Cell(1, (2, 3))
 
         def push(self):
             self.rows[0].append(self.settings["level"])
@@ -76,6 +77,7 @@ def test_objects_that_others_hold_too_stay_the_same_objects():
             self.seen.add((self.age, self.age))
             self.objects[0] = self.age
             self.tensor += 1
+            self.cell = Cell(self.age, (0, 0))
             return len(self.rows[0]) + self.array[1] + float(self.tensor[0]) + len(self.ordered["a"])
 
     env = SnapshotEnvWrapper(Shared(*held))
@@ -83,7 +85,7 @@ def test_objects_that_others_hold_too_stay_the_same_objects():
     before = vars(env.unwrapped) | {}
     env.verify()
     for name, value in before.items():
-        if type(value) in (dict, list, np.ndarray, OrderedDict, set, th.Tensor):
+        if type(value) in (dict, list, np.ndarray, OrderedDict, set, th.Tensor, Cell):
             assert vars(env.unwrapped)[name] is value, name
     assert held[0] == {"level": 1.0} and held[1] == [[1.0]] and held[3] == {"a": [1]} and held[4] == {(1, 2)}
     assert (

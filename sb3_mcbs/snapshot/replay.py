@@ -54,8 +54,9 @@ class Recorder:
         self._step = env.step
         # Many environments step once in their reset, and that step must not be recorded as well.
         self._inside = False
-        env.reset = functools.wraps(env.reset)(lambda **arguments: self.reset(**arguments))
-        env.step = functools.wraps(env.step)(lambda action: self.step(action))
+        # A copy of the environment is to call the copy of this object, so that it must not be closed over.
+        env.reset = functools.update_wrapper(functools.partial(Recorder.reset, self), env.reset)
+        env.step = functools.update_wrapper(functools.partial(Recorder.step, self), env.step)
         setattr(env, RECORDER, self)
 
     def reset(self, **arguments: Any) -> Any:
