@@ -1,6 +1,7 @@
 """How our algorithms get into RL Zoo: by the import hook, and explicitly."""
 
 import argparse
+import ctypes
 import importlib
 import os
 import runpy
@@ -9,6 +10,7 @@ import sys
 import types
 import warnings
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import mujoco
@@ -113,18 +115,22 @@ def test_only_the_warning_of_half_cheetahs_xml_is_hidden(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    mujoco.set_mju_user_warning(None)  # dm_control sets one when it is imported
     registration.make_vec_env(diverging, env_kwargs={"render_mode": "rgb_array"}).close()
     errors = capfd.readouterr().err
     assert "WARNING: Nan, Inf or huge value in QPOS" in errors and "settotalmass" not in errors
     assert "huge value in QPOS" in (tmp_path / "MUJOCO_LOG.TXT").read_text()
     assert mujoco.get_mju_user_warning() is None
-    seen: list[str] = []
+    seen: list[Any] = []
     mujoco.set_mju_user_warning(seen.append)
     try:
         registration.make_vec_env(diverging).close()
         assert len(seen) == 1 and "QPOS" in seen[0]
         gym.make("HalfCheetah-v5").close()
         assert len(seen) == 2, "what was there before is put back"
+        mujoco.set_mju_user_warning(compiled := ctypes.CFUNCTYPE(None, ctypes.c_char_p)(seen.append))
+        registration.make_vec_env(diverging).close()
+        assert b"QPOS" in seen[2] and mujoco.get_mju_user_warning() is compiled
     finally:
         mujoco.set_mju_user_warning(None)
 

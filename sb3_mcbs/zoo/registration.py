@@ -112,6 +112,7 @@ def _without_deprecation(make: Callable[..., gym.Env]) -> Callable[..., gym.Env]
 
     # A worker process gets this function by value, as it is nested: it need not import this package.
     def make_env(**kwargs: Any) -> gym.Env:
+        import ctypes
         import sys
 
         import mujoco
@@ -122,7 +123,8 @@ def _without_deprecation(make: Callable[..., gym.Env]) -> Callable[..., gym.Env]
             if hidden in message:
                 return
             if show is not None:
-                show(message)
+                # dm_control's takes bytes. MuJoCo ends the process if this function raises anything.
+                show(message.encode() if isinstance(show, ctypes._CFuncPtr) else message)  # type: ignore[attr-defined]
             else:  # as MuJoCo does by itself
                 print(f"WARNING: {message}\n", file=sys.stderr)
                 mujoco.mju_writeLog("WARNING", message)
