@@ -1,5 +1,6 @@
 """Act with search with any trained agent."""
 
+import operator
 from copy import deepcopy
 from dataclasses import replace
 from typing import Any
@@ -123,10 +124,11 @@ def _as_agents_vec_env(env: VecEnv | gym.Env, model: OffPolicyAlgorithm) -> VecE
     :raises ValueError: if its spaces are not the agent's.
     """
     vec_env = OffPolicyAlgorithm._wrap_env(_as_vec_env(env), monitor_wrapper=False)  # transposes images
-    spaces = (vec_env.observation_space, model.observation_space), (vec_env.action_space, model.action_space)
-    fits = _are_alike(*spaces[0]), spaces[1][0] == spaces[1][1]
-    for what, (ours, its), fit in zip(("observation", "action"), spaces, fits, strict=True):
-        if not fit:
+    for what, ours, its, alike in (
+        ("observation", vec_env.observation_space, model.observation_space, _are_alike),
+        ("action", vec_env.action_space, model.action_space, operator.eq),
+    ):
+        if not alike(ours, its):
             raise ValueError(
                 f"The agent was trained with the {what} space {its}, and vec_env has {ours}. Make the "
                 "environment with the same id, arguments and wrappers as for the training."

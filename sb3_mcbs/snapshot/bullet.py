@@ -37,7 +37,7 @@ from sb3_mcbs.snapshot.graph import Freezer, Ref
 from sb3_mcbs.snapshot.kinds import kind_of
 from sb3_mcbs.snapshot.layers import NOT_STATE, RECORDER
 from sb3_mcbs.snapshot.registry import SnapshotAdapter
-from sb3_mcbs.snapshot.replay import ReplayAdapter, _constructor_arguments
+from sb3_mcbs.snapshot.replay import ReplayAdapter, constructor_arguments
 
 _OURS = {RECORDER, "reset", "step", "close"}
 _METHODS = ("auto", "state", "replay")
@@ -90,7 +90,7 @@ class BulletAdapter(ReplayAdapter):
 
     def attach(self, env: Any) -> None:
         if find_recorder(env) is None:
-            _constructor_arguments(env, "simulates with PyBullet")
+            constructor_arguments(env, "simulates with PyBullet")
             BulletRecorder(env, self._prepare, self.not_state, self._names).look()
         _refuse_uncapturable(env, self.not_state)
 
@@ -174,7 +174,7 @@ class BulletAdapter(ReplayAdapter):
     def _make(self, obj: Any, recorder: BulletRecorder) -> Any:
         """Make another environment with the same constructor."""
         made: set[int] = set()
-        arguments = _constructor_arguments(obj, "simulates with PyBullet")
+        arguments = constructor_arguments(obj, "simulates with PyBullet")
         given = [*arguments.args, *arguments.kwargs.values()]
         shared = any(value is client for value in given for client in recorder.clients)
         if not shared:

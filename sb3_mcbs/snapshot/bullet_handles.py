@@ -30,7 +30,8 @@ _CONTAINERS = (
     dict, list, tuple, set, frozenset, deque,
     functools.partial, types.MethodType, types.FunctionType,
 )  # fmt: skip
-_STANDARD = ("builtins", "gymnasium", "collections", "functools", "types", "numpy")
+# Packages whose classes do not use PyBullet.
+_STANDARD = ("builtins", "gymnasium", "collections", "functools", "types")
 # How deep functions that methods call are looked into.
 _DEPTH = 2
 
@@ -207,13 +208,7 @@ def uses_bullet(env: Any) -> bool:
 
 def _class_uses_bullet(cls: type) -> bool:
     for base in cls.__mro__:
-        if base.__module__.partition(".")[0] in (
-            "builtins",
-            "gymnasium",
-            "collections",
-            "functools",
-            "types",
-        ):
+        if base.__module__.partition(".")[0] in _STANDARD:
             continue
         for member in vars(base).values():
             if isinstance(member, property):

@@ -16,14 +16,8 @@ from sb3_mcbs.snapshot.graph import MISSING, Copier, Freezer, Thawer, class_name
 #: Members that Python makes itself, and those that only say what a class is.
 _NOT_STATE = frozenset(
     {"__dict__", "__weakref__", "__module__", "__qualname__", "__doc__", "__slots__", "__slotnames__"}
-    | {
-        "__annotations__",
-        "__annotate__",
-        "__abstractmethods__",
-        "_abc_impl",
-        "__parameters__",
-        "__orig_bases__",
-    }
+    | {"__annotations__", "__annotate__", "__abstractmethods__", "_abc_impl", "__parameters__"}
+    | {"__orig_bases__"}
     | {"__static_attributes__", "__firstlineno__", "__classcell__", "__match_args__", "__dataclass_fields__"}
     | {"__dataclass_params__", "metadata", "spec", "render_mode"}
 )

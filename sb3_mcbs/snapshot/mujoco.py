@@ -179,8 +179,32 @@ def is_data(obj: Any) -> bool:
     return isinstance(obj, mujoco.MjData)
 
 
-class MjModelAdapter(SnapshotAdapter):
+class _MujocoAdapter(SnapshotAdapter):
+    """What models and data have in common: a state belongs to one model, and both hand out views."""
+
+    def _model_of(self, obj: Any) -> Any:
+        return obj.model
+
+    def validate(self, obj: Any, state: Any) -> None:
+        layout = _layout(self._model_of(obj))
+        if state.sizes != layout.sizes or state.names != layout.names:
+            _check_same_model(state.sizes, state.names, layout)
+
+    def place_of(self, obj: Any, view: Any) -> Any:
+        return place_of(obj, view)
+
+    def view_at(self, obj: Any, place: Any) -> Any:
+        return view_at(obj, place)
+
+    def clone_view(self, obj: Any, new: Any, view: Any) -> Any:
+        return counterpart(obj, new, view)
+
+
+class MjModelAdapter(_MujocoAdapter):
     """Captures the values of a model; snapshots share them for as long as nobody edits the model."""
+
+    def _model_of(self, obj: Any) -> Any:
+        return obj
 
     def capture(self, obj: Any) -> ModelState:
         layout = _layout(obj)
@@ -194,22 +218,8 @@ class MjModelAdapter(SnapshotAdapter):
             state.write(obj, layout)
             layout.last = state
 
-    def validate(self, obj: Any, state: ModelState) -> None:
-        layout = _layout(obj)
-        if state.sizes != layout.sizes or state.names != layout.names:
-            _check_same_model(state.sizes, state.names, layout)
-
     def clone(self, obj: Any, copy: Callable[[Any], Any]) -> Any:
         return obj.__copy__()
-
-    def place_of(self, obj: Any, view: Any) -> Any:
-        return place_of(obj, view)
-
-    def view_at(self, obj: Any, place: Any) -> Any:
-        return view_at(obj, place)
-
-    def clone_view(self, obj: Any, new: Any, view: Any) -> Any:
-        return counterpart(obj, new, view)
 
 
 # Making an MjData takes 100 times as long as copying into one, so those of dropped snapshots are used again.
@@ -299,7 +309,7 @@ def _unpickled(pickled: dict[str, Any], model: Any) -> Any:
     return data
 
 
-class MjDataAdapter(SnapshotAdapter):
+class MjDataAdapter(_MujocoAdapter):
     """Captures a whole ``MjData``."""
 
     def capture(self, obj: Any) -> DataState:
@@ -307,11 +317,6 @@ class MjDataAdapter(SnapshotAdapter):
 
     def restore(self, obj: Any, state: DataState) -> None:
         state.write(obj, obj.model)
-
-    def validate(self, obj: Any, state: DataState) -> None:
-        layout = _layout(obj.model)
-        if state.sizes != layout.sizes or state.names != layout.names:
-            _check_same_model(state.sizes, state.names, layout)
 
     def clone(self, obj: Any, copy: Callable[[Any], Any]) -> Any:
         model = copy(obj.model)
@@ -332,12 +337,3 @@ class MjDataAdapter(SnapshotAdapter):
             return True
 
         return diverged
-
-    def place_of(self, obj: Any, view: Any) -> Any:
-        return place_of(obj, view)
-
-    def view_at(self, obj: Any, place: Any) -> Any:
-        return view_at(obj, place)
-
-    def clone_view(self, obj: Any, new: Any, view: Any) -> Any:
-        return counterpart(obj, new, view)

@@ -146,7 +146,7 @@ class ReplayAdapter(SnapshotAdapter):
 
     def attach(self, env: Any) -> None:
         if _recorder(env) is None:
-            _constructor_arguments(env)
+            constructor_arguments(env)
             Recorder(env, self._prepare, self.not_state)
 
     def capture(self, obj: Any) -> Episode | None:
@@ -171,7 +171,7 @@ class ReplayAdapter(SnapshotAdapter):
         self._tell(obj, len(state.actions), time.perf_counter() - start)
 
     def clone(self, obj: Any, copy: Callable[[Any], Any]) -> Any:
-        arguments = _constructor_arguments(obj)
+        arguments = constructor_arguments(obj)
         made = type(obj)(*arguments.args, **arguments.kwargs)
         made.spec = obj.spec
         made.render_mode = None
@@ -193,9 +193,10 @@ def _recorder(env: Any) -> Recorder | None:
     return vars(env).get(RECORDER)
 
 
-def _constructor_arguments(env: Any, what: str = "is restored by replay") -> inspect.BoundArguments:
+def constructor_arguments(env: Any, what: str = "is restored by replay") -> inspect.BoundArguments:
     """Find the arguments that make another environment like this one, which draws nothing.
 
+    :param env: the environment.
     :param what: what is done with the environment, for the error.
     :raises SnapshotUnsupportedError: if they cannot be found out.
     """

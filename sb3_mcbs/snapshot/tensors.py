@@ -21,11 +21,15 @@ def is_tensor(obj: Any) -> bool:
 def bytes_of(tensor: Any) -> np.ndarray:
     """Return the whole memory that a tensor is a view of.
 
-    :param tensor: on the CPU.
+    :param tensor: the tensor; what is not on the CPU is copied.
     """
+    return _whole(tensor).cpu().numpy()
+
+
+def _whole(tensor: Any) -> Any:
+    """Return the whole memory of a tensor, as a tensor of bytes."""
     torch: Any = sys.modules["torch"]
-    whole = torch.empty(0, dtype=torch.uint8, device=tensor.device).set_(tensor.untyped_storage())
-    return whole.cpu().numpy()
+    return torch.empty(0, dtype=torch.uint8, device=tensor.device).set_(tensor.untyped_storage())
 
 
 class TensorKind:
@@ -122,9 +126,7 @@ def _can_be_put_back(current: Any, layout: tuple[Any, ...], content: np.ndarray)
 
 
 def _write(tensor: Any, content: np.ndarray) -> None:
-    torch: Any = sys.modules["torch"]
-    whole = torch.empty(0, dtype=torch.uint8, device=tensor.device).set_(tensor.untyped_storage())
-    whole.copy_(torch.tensor(content))
+    _whole(tensor).copy_(sys.modules["torch"].tensor(content))
 
 
 def _storage(content: np.ndarray, layout: tuple[Any, ...]) -> Any:

@@ -176,14 +176,14 @@ def check_exact(checked: Checked, layers: Sequence[Layer], action_space: gym.Spa
     name = type(layers[-1].env).__name__
     as_it_came = _fingerprint(layers)
     with globals_kept():
-        n_steps = _check(checked, layers[-1].env, action_space)
+        n_steps = _check_each_way(checked, layers[-1].env, action_space)
     # A reset may have given it more attributes, as it may have done with the next one.
     _passed.setdefault(type(layers[-1].env), set()).update((as_it_came, _fingerprint(layers)))
     seconds = time.perf_counter() - start
     logger.info("snapshots of %s were checked: exact in %d steps (%.2f s)", name, n_steps, seconds)
 
 
-def _check(checked: Checked, env: Any, action_space: gym.Space) -> int:
+def _check_each_way(checked: Checked, env: Any, action_space: gym.Space) -> int:
     """Check an environment, and again if its adapter knows another way to capture it.
 
     :return: how many steps the comparisons took.
