@@ -90,7 +90,7 @@ class Decision:
         self.simulated_steps = self.search().simulated_steps
         if self.is_batched:  # its engine has its size now
             self._record_physics()
-        functions = self.searcher._functions
+        functions = self.searcher.agent_functions()
         policy_rows, value_rows = [], []
 
         def noted_policy(observations: Any) -> np.ndarray:
@@ -101,9 +101,10 @@ class Decision:
             value_rows.append(len(observations))
             return functions.value(observations, actions)
 
-        self.searcher._functions = functions._replace(policy=noted_policy, value=noted_value)
+        noted = functions._replace(policy=noted_policy, value=noted_value)
+        self.searcher.agent_functions = lambda: noted  # type: ignore[method-assign]
         self.search()
-        self.searcher._functions = functions
+        del self.searcher.agent_functions
         critics: list[Any] = self.agent.critic.q_networks
         calls = [(self.agent.actor.mu, n) for n in policy_rows]
         calls += [(critic, n) for n in value_rows for critic in critics]

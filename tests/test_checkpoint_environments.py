@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import warnings
+from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
@@ -91,6 +92,19 @@ class WithTensors(Point):
         return float(self.memory.sum()) % 5
 
 
+class WithDrawings(Point):
+    def prepare(self) -> None:
+        pygame = pytest.importorskip("pygame")
+        self.world, self.at = pygame.Surface((6, 6)), pygame.Vector2(0, 1)
+        self.part, self.mask = self.world.subsurface((1, 1, 4, 4)), pygame.Mask((3, 3))
+
+    def push(self) -> float:
+        self.at.x += 1
+        self.part.set_at((int(self.at.x) % 4, 1), (int(self.at.x) % 200, 0, 0))
+        self.mask.set_at((int(self.at.x) % 3, 1))
+        return float(sum(self.world.get_at((x, 2))[0] for x in range(6)) + self.mask.count()) % 7
+
+
 class WithSpaces(Point):
     def prepare(self) -> None:
         self.exchange(1)
@@ -106,11 +120,26 @@ class WithSpaces(Point):
         return float(goal["a"] + goal["b"][0])
 
 
+class Pushing(gym.Wrapper):
+    """Sets something on the Monitor that it wraps."""
+
+    def __init__(self) -> None:
+        super().__init__(Monitor(Point()))
+        self.env.observation_space = spaces.Box(-99, 99, (2,), np.float32)
+        self.env.n_pushes = 0
+        self.env.step = partial(self.push, self.env.step)
+
+    def push(self, step, action):
+        self.env.n_pushes += 1
+        observation, *rest = step(action)
+        return (observation + self.env.n_pushes % 3).astype(np.float32), *rest
+
+
 def env_of(make):
     return lambda folder: DummyVecEnv([lambda: Monitor(make(), str(folder / "monitor.csv"))])
 
 
-@pytest.mark.parametrize("make", [of_local_classes, WithTensors, WithSpaces])
+@pytest.mark.parametrize("make", [of_local_classes, WithTensors, WithDrawings, WithSpaces, Pushing])
 def test_resumed_is_exact(make, tmp_path: Path) -> None:
     def agent(folder: Path):
         networks = dict(net_arch=[16, 16])

@@ -14,7 +14,7 @@ from stable_baselines3 import DDPG
 from sb3_mcbs import CheckpointError, ExactCheckpointCallback, resume
 from sb3_mcbs.checkpoints import register_state, store
 from sb3_mcbs.checkpoints.encoding import Decoder, Encoder
-from sb3_mcbs.checkpoints.store import Store
+from sb3_mcbs.checkpoints.store import Store, write_arrays, write_file
 from sb3_mcbs.snapshot import SnapshotUnsupportedError
 from tests.checkpoint_helpers import CrashAt, assert_same_parameters, crash, learn
 from tests.test_checkpoints import maker
@@ -183,6 +183,14 @@ def test_the_other_folder_may_not_be_that_of_another_run(folder, tmp_path_factor
     shutil.copytree(folder / "checkpoints", other / "checkpoints")
     with pytest.raises(CheckpointError, match="holds the checkpoints of a run"):
         learn(resume(folder / "checkpoints"), other, 200)
+
+
+def test_nothing_is_left_to_be_flushed_later(tmp_path):
+    """``python -X dev`` says so of files that fail when they are collected."""
+    files = []
+    write_file(tmp_path / "file", files.append)
+    write_arrays(tmp_path / "arrays.npz", {"a": np.zeros(3)})
+    assert files[0].closed
 
 
 def test_disk_use_stays_below_twice_the_buffer(tmp_path):

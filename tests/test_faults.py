@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNorm
 from stable_baselines3.her import HerReplayBuffer
 
 from sb3_mcbs import MCBSTD3, NonFiniteError, SearchPolicy, SnapshotEnvWrapper, WorkerError
-from sb3_mcbs.algorithms.faults import break_trajectories
+from sb3_mcbs.algorithms.faults import InvalidDecisions, break_trajectories
 from tests.conftest import snapshot_vec_env
 
 
@@ -451,3 +451,59 @@ def test_errors_that_are_no_worker_s(make_agent) -> None:
         make_agent(vec_env).learn(100, callback=DiskFull())
     assert vec_env.reset().shape == (2, 3), "the workers go on"
     vec_env.close()
+
+
+class RaisesInCopies(gym.Wrapper):
+    """Steps only itself, once it is armed: copies carry the identity of the original."""
+
+    def __init__(self, env: gym.Env) -> None:
+        super().__init__(env)
+        self.armed: int | None = None
+
+    def step(self, action):
+        if self.armed not in (None, id(self)):
+            raise OSError("table.csv is not there")
+        return super().step(action)
+
+
+def arm(wrapper: SnapshotEnvWrapper) -> None:
+    layer = wrapper.env
+    layer.armed = id(layer)
+
+
+@pytest.mark.parametrize(("vec_env_cls", "n_envs"), [(DummyVecEnv, 1), (DummyVecEnv, 2), (SubprocVecEnv, 2)])
+@pytest.mark.parametrize("strategy", ["beam", "tree", "refine"])
+def test_all_simulations_invalid_is_no_quiet_state(make_agent, caplog, vec_env_cls, n_envs, strategy) -> None:
+    if vec_env_cls is SubprocVecEnv and strategy != "beam":
+        pytest.skip("workers do the same for every strategy")
+    env = vec_env_cls([lambda: SnapshotEnvWrapper(RaisesInCopies(gym.make("Pendulum-v1")))] * n_envs)
+    agent = make_agent(env, strategy=strategy)
+    env.env_method("apply", arm)
+    with pytest.warns(
+        UserWarning, match="All simulations of the last 1[0-9] decisions were invalid.*OSError"
+    ):
+        agent.learn(20 + 120 * n_envs)
+    said = [record.getMessage() for record in caplog.records if "All simulations" in record.message]
+    assert [f"last {count} " in text for count, text in zip((10, 100), said, strict=True)] == [True, True]
+    assert all("the policy's own actions are executed instead" in text for text in said)
+    # The traceback shows where it happened, once.
+    assert ['table.csv is not there")' in text for text in said] == [True, False]
+    values = agent.logger.name_to_value
+    assert values["search/invalid_rollouts"] == agent.n_invalid_rollouts >= values["search/decisions"] > 100
+    env.close()
+
+
+def test_invalid_decisions_are_counted_in_a_row(make_agent, caplog) -> None:
+    agent = make_agent("InvertedPendulum-v5").learn(30)
+    found = agent._search([0])
+    invalid = found._replace(chosen=np.array([-1]), invalid_rollouts=6)
+    decisions = InvalidDecisions()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for result in [invalid] * 9 + [found] + [invalid] * 9 + [found._replace(chosen=np.array([-1]))]:
+            decisions.note(result, agent._searcher.model)
+    for _ in range(9):
+        decisions.note(invalid, agent._searcher.model)
+    with pytest.warns(UserWarning, match="last 10 decisions .* They diverged"):
+        decisions.note(invalid, agent._searcher.model)
+    assert "Traceback" not in caplog.text

@@ -13,9 +13,9 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 
 from sb3_mcbs import MCBSTD3, SearchPolicy
-from sb3_mcbs.algorithms import networks
 from sb3_mcbs.algorithms.mlp import MLP
 from sb3_mcbs.algorithms.networks import entropy_function, policy_function, value_function
+from sb3_mcbs.algorithms.plain_networks import actor_mlp
 from sb3_mcbs.algorithms.torch_settings import matmul_precision, one_thread
 from tests.conftest import SEARCHING, SMALL, WITHOUT_SEARCH
 
@@ -168,14 +168,16 @@ def test_truncated_values_need_a_quantile():
 def test_present_parameters_and_networks_are_used():
     agent, other = agent_of(TD3), agent_of(TD3, activation_fn=th.nn.Tanh)
     observations = np.random.default_rng(0).standard_normal((3, 17))
-    policy = policy_function(agent)
-    policy(observations)
+    before = policy_function(agent)(observations)
     with th.no_grad():
         agent.actor.mu[0].weight.mul_(2)  # as an optimizer does
         agent.actor.mu[2].weight.data = agent.actor.mu[2].weight.data * 3  # as ``to(device)`` does
-    np.testing.assert_allclose(policy(observations), sb3_action(agent, observations), rtol=1e-5, atol=1e-6)
+    found = policy_function(agent)(observations)
+    np.testing.assert_allclose(found, sb3_action(agent, observations), rtol=1e-5, atol=1e-6)
+    assert abs(found - before).max() > 0.01
     agent.policy.actor = other.actor
-    np.testing.assert_allclose(policy(observations), sb3_action(other, observations), rtol=1e-5, atol=1e-6)
+    found = policy_function(agent)(observations)
+    np.testing.assert_allclose(found, sb3_action(other, observations), rtol=1e-5, atol=1e-6)
 
 
 def test_hooks_run():
@@ -186,19 +188,21 @@ def test_hooks_run():
     np.testing.assert_allclose(expected, sb3_action(agent, np.ones((2, 17))), rtol=1e-5, atol=1e-6)
     assert bias.requires_grad
     with pytest.raises(TypeError, match="hooks"):
-        networks.actor_mlp(agent.actor)
+        actor_mlp(agent.actor)
 
 
 def test_images_are_not_flattened():
     agent = agent_of(TD3)
     agent.actor.observation_space = spaces.Box(0, 255, (3, 40, 40), np.uint8)
     with pytest.raises(TypeError, match="vectors"):
-        networks.actor_mlp(agent.actor)
+        actor_mlp(agent.actor)
 
 
 def test_other_layers_are_named():
     with pytest.raises(TypeError, match="LayerNorm"):
         MLP(th.nn.Linear(2, 2), th.nn.LayerNorm(2))
+    with pytest.raises(TypeError, match="no layers"):
+        MLP(th.nn.Sequential())
 
 
 def test_gradients_against_autograd():
@@ -211,12 +215,13 @@ def test_gradients_against_autograd():
     (network(rows) * weight).sum().backward()
     expected = [p.grad.clone() for p in network.parameters()]
     mlp, x = MLP(network), rows.detach().t().contiguous()
-    outputs = mlp.outputs(x)
-    by_input = mlp.backward(x, outputs, weight.t().contiguous(), of_parameters=False)
-    np.testing.assert_allclose(by_input.t(), rows.grad, rtol=1e-5, atol=1e-6)
-    for parameter in network.parameters():
-        parameter.grad = None
-    mlp.backward(x, mlp.outputs(x), weight.t().contiguous(), of_parameters=True)
+    with th.no_grad():
+        outputs = mlp.outputs(x)
+        by_input = mlp.backward(x, outputs, weight.t().contiguous(), of_parameters=False)
+        np.testing.assert_allclose(by_input.t(), rows.grad, rtol=1e-5, atol=1e-6)
+        for parameter in network.parameters():
+            parameter.grad = None
+        mlp.backward(x, mlp.outputs(x), weight.t().contiguous(), of_parameters=True)
     for parameter, gradient in zip(network.parameters(), expected, strict=True):
         np.testing.assert_allclose(parameter.grad, gradient, rtol=1e-5, atol=1e-6)
 
@@ -240,15 +245,16 @@ def test_process_wide_settings_are_put_back():
 
 def test_the_update_that_is_used(capsys):
     fast = MCBSTD3("MlpPolicy", "Pendulum-v1", verbose=1, **SMALL)
-    assert fast._update is not None
+    assert fast._present_update() is not None
     own = MCBSTD3("MlpPolicy", "Pendulum-v1", fast_update=False, **SMALL)
-    assert own._update is None
+    assert own._present_update() is None
     capsys.readouterr()
     settings = {**SMALL, "policy_kwargs": dict(net_arch=[8], activation_fn=th.nn.ELU)}
     other = MCBSTD3("MlpPolicy", make_vec_env("Pendulum-v1"), verbose=1, learning_starts=10, **settings)
-    assert other._update is None
-    assert "SB3's own" in capsys.readouterr().out
+    assert other._present_update() is None
     other.learn(15)
+    said = capsys.readouterr().out
+    assert said.count("Gradient steps are SB3's own, not the fast ones: ELU is not covered") == 1
     assert other._n_updates == 5
     with pytest.raises(TypeError, match="fast_update"):
         MCBSTD3("MlpPolicy", "Pendulum-v1", fast_update="yes", **SMALL)

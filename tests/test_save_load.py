@@ -7,7 +7,7 @@ import pytest
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_mcbs import MCBSTD3
-from sb3_mcbs.search import PRESETS, SearchSettings
+from sb3_mcbs.search import SearchSettings
 from tests.conftest import SEARCHING, SMALL, WITHOUT_SEARCH, assert_same_parameters, snapshot_vec_env
 
 
@@ -77,9 +77,7 @@ def test_presets_are_where_settings_start_from(tmp_path, cls):
     for unknown in ("quick", 3, ["paper"]):
         with pytest.raises(ValueError, match=r"There is no preset .*; known are paper, efficient"):
             make(preset=unknown)
-    with pytest.raises(ValueError, match=r"preset='strong' is for constructors.*PRESETS\['strong'\]"):
-        cls.load(tmp_path / "agent", preset="strong", device="cpu")
-    changed = cls.load(tmp_path / "agent", device="cpu", **PRESETS["strong"])
+    changed = cls.load(tmp_path / "agent", device="cpu", preset="strong")
     assert changed.search_settings == SearchSettings.preset("strong", n_threads=1)
 
 

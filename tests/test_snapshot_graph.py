@@ -5,6 +5,7 @@ import dataclasses
 import functools
 import mmap
 import pickle
+import weakref
 from collections import namedtuple
 
 import gymnasium as gym
@@ -13,7 +14,7 @@ import pytest
 from gymnasium import spaces
 from gymnasium.wrappers import TransformObservation, TransformReward
 
-from sb3_mcbs.snapshot import SnapshotEnvWrapper, SnapshotMismatchError
+from sb3_mcbs.snapshot import SnapshotEnvWrapper, SnapshotMismatchError, SnapshotUnsupportedError
 
 
 @dataclasses.dataclass(frozen=True)
@@ -370,3 +371,33 @@ def test_function_with_a_cache_that_its_module_names():
         target.restore(state)
         assert follow(target) == expected
         assert target.env.func.func is spaces.flatten
+
+
+class Linked(Small):
+    def prepare(self):
+        self.parts = [Settings(at=0.0), Settings(at=1.0)]
+        self.chosen, self.gone = weakref.ref(self.parts[0]), weakref.ref(Node(0))
+        self.me, self.again = weakref.ref(self), weakref.ref(self.parts[1])
+
+    def advance(self):
+        self.chosen().at += 1
+        self.chosen = weakref.ref(self.parts[int(self.me().total) % 2])
+        return self.chosen().at + self.again().at + (self.gone() is None)
+
+
+def test_weak_references():
+    env = wrapped(Linked)
+    follow(env, 3)
+    state, clone = env.snapshot(), env.clone()
+    expected = follow(env)
+    other = SnapshotEnvWrapper(Linked())
+    for target in (clone, env, clone, other):
+        target.restore(pickle.loads(pickle.dumps(state)))
+        inner = target.unwrapped
+        assert inner.me() is inner and any(inner.chosen() is part for part in inner.parts)
+        assert follow(target) == expected
+    del env.unwrapped.parts[1], target
+    held, env.unwrapped.again = Settings(at=1.0), None
+    env.unwrapped.chosen = weakref.ref(held)
+    with pytest.raises(SnapshotUnsupportedError, match=r"is to a .*Settings that nothing else in it holds"):
+        env.snapshot()

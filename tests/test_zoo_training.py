@@ -42,6 +42,28 @@ def test_finds_its_hyperparameters_and_trains_with_search(mcbs_run: Path) -> Non
     assert model.n_simulated_steps == 600
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["preset:'efficient'"],
+        ["preset:balanced", "beam_width:7"],
+        ["preset:None", "beam_width:2", "n_simulations:1"],
+    ],
+)
+def test_another_preset_for_a_trained_agent(
+    mcbs_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str]
+) -> None:
+    trained = mcbs_run / "logs" / "mcbs_td3" / "Pendulum-v1_1" / "Pendulum-v1.zip"
+    more = ("-n", "110", "--eval-freq", "-1", "-i", str(trained), "-params", "learning_starts:100", *words)
+    zoo_train(monkeypatch, tmp_path, "mcbs_td3", *more)
+    settings = MCBSTD3.load(
+        tmp_path / "logs" / "mcbs_td3" / "Pendulum-v1_1" / "Pendulum-v1.zip"
+    ).search_settings
+    strategy, width, simulations = settings.strategy, settings.beam_width, settings.n_simulations
+    expected = {"efficient": ("beam", 6, 1), "balanced": ("refine", 7, 1), "None": ("beam", 2, 1)}
+    assert (strategy, width, simulations) == next(expected[name] for name in expected if name in words[0])
+
+
 def test_both_policies_are_evaluated_where_rl_zoo_draws_them(mcbs_run: Path) -> None:
     logs = mcbs_run / "logs"
     with_search = evaluations(logs / "mcbs_td3" / "Pendulum-v1_1")

@@ -11,11 +11,12 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 logger = logging.getLogger("sb3_mcbs")
 
 
-def noise_without_search(agent: OffPolicyAlgorithm, noise: float) -> ActionNoise | None:
+def noise_without_search(agent: OffPolicyAlgorithm, noise: float, say: bool = True) -> ActionNoise | None:
     """The noise of a deterministic actor for what is not searched, if it has none of its own.
 
     :param agent: an agent that does not search at every step.
     :param noise: standard deviation of Gaussian noise, in the action space scaled to [-1, 1].
+    :param say: whether the user is told.
     """
     if agent.action_noise is not None or isinstance(agent, SAC | TQC):
         return None
@@ -23,9 +24,10 @@ def noise_without_search(agent: OffPolicyAlgorithm, noise: float) -> ActionNoise
         "action_noise is None, and not every decision is searched: where the actor acts, Gaussian noise of "
         f"beam_noise={noise} is added. Pass an action_noise to choose another."
     )
-    logger.info(message)
-    if agent.verbose >= 1:
-        print(message)
+    if say:
+        logger.info(message)
+        if agent.verbose >= 1:
+            print(message)
     shape = agent.action_space.shape or ()
     gaussian = NormalActionNoise(np.zeros(shape), np.full(shape, noise))
     return VectorizedActionNoise(gaussian, agent.n_envs) if agent.n_envs > 1 else gaussian

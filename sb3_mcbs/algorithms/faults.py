@@ -1,5 +1,6 @@
 """What goes wrong while an agent acts in its environments: noticed, named, kept out of what it learns."""
 
+import inspect
 import logging
 import math
 import traceback
@@ -22,9 +23,9 @@ from stable_baselines3.common.vec_env import (
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn, VecEnvWrapper
 from stable_baselines3.her import HerReplayBuffer
 
-from sb3_mcbs.models.base import Observations
+from sb3_mcbs.models.base import ForwardModel, Observations
 from sb3_mcbs.models.workers import await_answers, worker_error
-from sb3_mcbs.search.interface import map_arrays
+from sb3_mcbs.search.interface import SearchResult, map_arrays
 from sb3_mcbs.snapshot import SIMULATION_DIVERGED
 
 logger = logging.getLogger("sb3_mcbs")
@@ -44,7 +45,9 @@ def environment_named(vec_env: VecEnv) -> Iterator[None]:
 
     :param vec_env: the environments that are stepped inside.
     :raises WorkerError: if the worker process of an environment has ended; one that hangs is not noticed.
+    :raises ValueError: see :func:`check_whole`.
     """
+    check_whole(vec_env)
     try:
         yield
     except Exception as error:
@@ -61,6 +64,22 @@ def environment_named(vec_env: VecEnv) -> Iterator[None]:
         raise
 
 
+def check_whole(vec_env: VecEnv) -> None:
+    """Refuse wrappers around nothing.
+
+    :param vec_env: the environments.
+    :raises ValueError: if there are none, as in a copy of a ``VecNormalize``.
+    """
+    layer: Any = vec_env
+    while isinstance(layer, VecEnvWrapper):
+        name, layer = type(layer).__name__, vars(layer).get("venv")
+        if layer is None:
+            raise ValueError(
+                f"There are no environments in this {name}: SB3 leaves them out of its copies. Give it some "
+                "with set_venv(...), or the agent others with set_env(...)."
+            )
+
+
 class CheckedVecEnv(VecEnvWrapper):
     """Environments whose observations and rewards are checked before anyone else sees them.
 
@@ -73,8 +92,14 @@ class CheckedVecEnv(VecEnvWrapper):
         super().__init__(venv)
         self.unstored: tuple[Any, np.ndarray, np.ndarray] | None = None
         self._normalizer = unwrap_vec_normalize(venv)
-        self._workers = venv.unwrapped if isinstance(venv.unwrapped, SubprocVecEnv) else None
         self._actions = np.zeros(0)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # SB3's wrappers note what their class has, which cannot be copied.
+        return {name: value for name, value in vars(self).items() if name != "class_attributes"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state, class_attributes=dict(inspect.getmembers(type(self))))
 
     def reset(self) -> VecEnvObs:
         return self.venv.reset()
@@ -91,8 +116,9 @@ class CheckedVecEnv(VecEnvWrapper):
         """
         normalizer = self._normalizer
         before = None if normalizer is None else _Statistics(normalizer)
-        if self._workers is not None:
-            await_answers(self._workers, range(self.num_envs))
+        base = self.venv.unwrapped
+        if isinstance(base, SubprocVecEnv):
+            await_answers(base, range(self.num_envs))
         result = self.venv.step_wait()
         observations, rewards, dones, infos = result
         if normalizer is not None:
@@ -169,6 +195,42 @@ def check_networks(
         "can be chosen. Go back to an agent that was saved earlier, and train with a lower "
         "learning_rate, or with rewards and observations on a smaller scale (VecNormalize)."
     )
+
+
+class InvalidDecisions:
+    """Tells of decisions in a row in which every simulation was invalid: after 10, 100, 1000, ..."""
+
+    def __init__(self) -> None:
+        self._in_a_row = 0
+        self._said_why = False
+
+    def note(self, result: SearchResult, model: ForwardModel | None) -> None:
+        """Count a decision.
+
+        :param result: of the search.
+        :param model: what simulated; ``None`` if nothing did.
+        """
+        if (result.chosen >= 0).any() or not result.invalid_rollouts:
+            self._in_a_row = 0
+            return
+        before, self._in_a_row = self._in_a_row, self._in_a_row + len(result.chosen)
+        if self._in_a_row < 10 or len(str(before)) == len(str(self._in_a_row)):
+            return
+        message = (
+            f"All simulations of the last {self._in_a_row} decisions were invalid: nothing is chosen by "
+            "search, and the policy's own actions are executed instead. "
+        )
+        error = "" if model is None else model.first_error
+        if error:
+            message += f"A copy of the environment raised {error.strip().splitlines()[-1]}"
+        else:
+            message += (
+                "They diverged, or their observations, rewards or values were not finite. A smaller "
+                "rollout_depth or beam_noise may help."
+            )
+        logger.error("%s%s", message, f"\n{error}" if error and not self._said_why else "")
+        warnings.warn(message, stacklevel=5)
+        self._said_why = True
 
 
 def is_finite(values: np.ndarray) -> bool:

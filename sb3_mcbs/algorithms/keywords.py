@@ -1,8 +1,8 @@
-"""The settings of the search and of its schedule as parameters of constructors."""
+"""The settings of the search, and of what is learned from it, as parameters of constructors."""
 
 import inspect
 from collections.abc import Mapping
-from dataclasses import Field, fields
+from dataclasses import Field, asdict, fields
 from typing import Any, TypedDict
 
 from sb3_mcbs.algorithms.learned_model import EnsembleSettings
@@ -10,6 +10,7 @@ from sb3_mcbs.algorithms.rollout_replay import RolloutReplaySettings
 from sb3_mcbs.algorithms.value_expansion import ValueExpansionSettings
 from sb3_mcbs.search import ScheduleSettings, SearchSettings, with_preset
 from sb3_mcbs.search.checks import CheckedSettings
+from sb3_mcbs.search.settings import OF_THE_MACHINE
 
 #: What an agent's constructor takes besides SB3's parameters, as attributes of the same names.
 SETTINGS: tuple[type[CheckedSettings], ...] = (
@@ -26,53 +27,6 @@ _SEARCH_SETTINGS = "search_settings"
 
 class SearchKeywords(TypedDict, total=False):
     """The fields of :data:`SETTINGS` as keyword arguments, for type checkers."""
-
-    beam_width: int
-    rollout_depth: int
-    n_simulations: int
-    beam_noise: float
-    rollout_noise: float | None
-    noise_clip: float | None
-    include_policy_action: bool
-    n_threads: int
-    forward_model: str
-    matmul_precision: str | None
-    time_budget: float | None
-    max_beam_width: int | None
-    strategy: str
-    n_proposals: int | None
-    common_noise: bool
-    antithetic: bool
-    branching: int
-    one_node_per_root: bool
-    n_rounds: int
-    n_elites: int | None
-    min_noise: float
-    entropy_bonus: bool
-    tqc_value: str
-    noise_hold: int
-    proposal_dims: int | None
-    search_schedule: str
-    search_share: float
-    search_unit: str
-    final_search_share: float | None
-    final_beam_width: int | None
-    final_rollout_depth: int | None
-    saturation_window: int
-    saturation_tolerance: float
-    recovery_tolerance: float
-    rollout_replay: float
-    value_expansion: int
-    expanded_share: float
-    ensemble_size: int
-    ensemble_train_freq: int
-    ensemble_gradient_steps: int
-    ensemble_max_error: float
-    ensemble_pessimism: float
-
-
-class SearchAttributes:
-    """The fields of :data:`SETTINGS` as attributes of an agent, for type checkers."""
 
     beam_width: int
     rollout_depth: int
@@ -162,6 +116,24 @@ def complete_settings(
             f"{list(known)}."
         )
     return {**known, **with_preset(preset, given)}
+
+
+def settings_of_preset(name: str) -> dict[str, Any]:
+    """What an agent that was made with other settings, or a hyperparameter file, takes over from a preset.
+
+    :param name: one of :data:`~sb3_mcbs.search.PRESETS`.
+    :return: every setting of how is searched; for ``"paper"``, which is Algorithm 1 at every step, also those
+        of when is searched, what is learned from simulations and whether searched actions get noise.
+    :raises ValueError: if there is no such preset.
+    """
+    settings = asdict(SearchSettings.preset(name))
+    for setting in OF_THE_MACHINE:
+        del settings[setting]
+    if name == "paper":
+        for defaults in (ScheduleSettings(), RolloutReplaySettings(), ValueExpansionSettings()):
+            settings |= asdict(defaults)
+        settings["action_noise_after_search"] = False
+    return settings
 
 
 def setting_fields() -> list[Field]:

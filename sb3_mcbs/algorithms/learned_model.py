@@ -146,6 +146,22 @@ def set_up_learned_model(agent: Any) -> None:
     agent.learned_model.check(agent, settings)
 
 
+def check_learned_model(agent: Any) -> None:
+    """Refuse changed settings that are for another learned model than the agent has.
+
+    :param agent: an :class:`~sb3_mcbs.MCBS` agent that was set up.
+    :raises ValueError: if a setting is wrong, or does not fit.
+    """
+    settings = EnsembleSettings.of(agent)
+    if (agent.forward_model == "ensemble") != (agent.learned_model is not None):
+        raise ValueError(
+            "Whether an agent learns a model (forward_model='ensemble') is decided when it is made or "
+            "loaded: save it, and load it with another forward_model."
+        )
+    if agent.learned_model is not None:
+        agent.learned_model.check(agent, settings)
+
+
 def read_transitions(buffer: ReplayBuffer) -> tuple[Transitions, np.ndarray]:
     """What a replay buffer holds, without drawing from it, which would change what the agent draws.
 

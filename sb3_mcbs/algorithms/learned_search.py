@@ -8,9 +8,9 @@ import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_mcbs.algorithms.learned_model import EnsembleSettings, LearnedModel
+from sb3_mcbs.algorithms.learned_model import LearnedModel
 from sb3_mcbs.algorithms.searcher import Searcher
-from sb3_mcbs.algorithms.vec_env_view import AgentView, reward_normalizer
+from sb3_mcbs.algorithms.vec_env_view import AgentView
 from sb3_mcbs.models.base import Observations
 from sb3_mcbs.models.ensemble import Transitions
 from sb3_mcbs.models.ensemble_model import EnsembleModel
@@ -54,20 +54,19 @@ class LearnedSearcher(Searcher):
     :raises ValueError: if the agent has no learned model.
     """
 
-    def _connect(self, vec_env: VecEnv, normalize_reward: bool | None) -> None:
+    _originals: Any = None
+    _n_searches = 0
+    _said_not_ready = False
+
+    def _connect(self) -> None:
         agent: Any = self.agent
-        model_settings = EnsembleSettings.of(agent)
-        self.view = AgentView(vec_env, reward_normalizer(agent.get_env(), vec_env, normalize_reward))
-        self._all_envs = range(vec_env.num_envs)
+        self.view = AgentView(self._vec_env, self._reward_normalizer())
+        self._all_envs = range(self._vec_env.num_envs)
         ensemble = self._learned_model.ensemble
         self._ensemble_model = EnsembleModel(
-            ensemble, agent.observation_space, agent.action_space, model_settings.ensemble_pessimism
+            ensemble, agent.observation_space, agent.action_space, agent.ensemble_pessimism
         )
         self.model = self._ensemble_model
-        self._max_error = model_settings.ensemble_max_error
-        self._originals: Any = None
-        self._n_searches = 0
-        self._said_not_ready = False
 
     @property
     def _learned_model(self) -> LearnedModel:
@@ -82,7 +81,8 @@ class LearnedSearcher(Searcher):
 
     @property
     def ready(self) -> bool:
-        return self._learned_model.ensemble.held_out_error <= self._max_error
+        agent: Any = self.agent
+        return self._learned_model.ensemble.held_out_error <= agent.ensemble_max_error
 
     def search(
         self,
@@ -93,7 +93,9 @@ class LearnedSearcher(Searcher):
         record: bool = False,
     ) -> SearchResult:
         if self.ready:
+            agent: Any = self.agent
             self._ensemble_model.ensemble = self._learned_model.ensemble
+            self._ensemble_model.pessimism = agent.ensemble_pessimism
             return super().search(observations, rng, envs, effort, record)
         if not self._said_not_ready:
             self._said_not_ready = True
@@ -101,7 +103,7 @@ class LearnedSearcher(Searcher):
                 "The learned model is not used yet: its held-out error is %.3g, above "
                 "ensemble_max_error=%.3g. The policy acts alone.",
                 self._learned_model.ensemble.held_out_error,
-                self._max_error,
+                self.agent.ensemble_max_error,  # type: ignore[attr-defined]
             )
         return self._policy_alone(observations, envs)
 

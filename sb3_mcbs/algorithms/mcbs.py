@@ -13,6 +13,7 @@ from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
+from sb3_mcbs.algorithms.attributes import SearchAttributes
 from sb3_mcbs.algorithms.exploration import DrawnNoise, noise_without_search
 from sb3_mcbs.algorithms.faults import (
     CheckedVecEnv,
@@ -22,8 +23,13 @@ from sb3_mcbs.algorithms.faults import (
     leave_out_step,
     warn_of_divergence,
 )
-from sb3_mcbs.algorithms.keywords import SearchAttributes, complete_settings, list_search_settings
-from sb3_mcbs.algorithms.learned_model import EnsembleSettings, LearnedModel, set_up_learned_model
+from sb3_mcbs.algorithms.keywords import complete_settings, list_search_settings, settings_of_preset
+from sb3_mcbs.algorithms.learned_model import (
+    EnsembleSettings,
+    LearnedModel,
+    check_learned_model,
+    set_up_learned_model,
+)
 from sb3_mcbs.algorithms.learned_search import make_searcher
 from sb3_mcbs.algorithms.searcher import Searcher
 from sb3_mcbs.algorithms.simulated_batches import SimulatedBatches
@@ -79,7 +85,7 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         """
         for name, value in complete_settings(type(self).__name__, settings, preset).items():
             setattr(self, name, value)
-        self.preset = self._preset_taken_over = preset
+        self.preset = preset
         self.action_noise_after_search = action_noise_after_search
 
         self.search_rng: np.random.Generator | None = None
@@ -100,28 +106,18 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         self._checked_env: CheckedVecEnv | None = None
         self._noise_without_search: ActionNoise | None = None
 
-    @property
-    def search_settings(self) -> SearchSettings:
-        """The settings of the search, checked."""
-        return SearchSettings.of(self)
-
-    @property
-    def schedule_settings(self) -> ScheduleSettings:
-        """The settings of the search's schedule, checked."""
-        return ScheduleSettings.of(self)
-
-    def _setup_model(self) -> None:
-        # ``load`` sets attributes without calling the constructor, so settings are checked here.
-        if self.preset != self._preset_taken_over:
-            raise ValueError(
-                f"preset={self.preset!r} is for constructors; load takes **PRESETS[{self.preset!r}] instead."
-            )
+    def _checked_settings(self) -> tuple[SearchSettings, ScheduleSettings]:
         settings, schedule = self.search_settings, self.schedule_settings
         schedule.check_search(settings)
         if not isinstance(self.action_noise_after_search, bool):
             raise TypeError(
                 f"action_noise_after_search must be True or False, got {self.action_noise_after_search!r}."
             )
+        return settings, schedule
+
+    def _setup_model(self) -> None:
+        # ``load`` sets attributes without calling the constructor, so settings are checked here.
+        settings, schedule = self._checked_settings()
         # ``load`` seeds once more; generators that it has restored go on instead.
         self._is_restored = self.search_rng is not None and self._seed_at_setup == self.seed
         super()._setup_model()
@@ -139,13 +135,37 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         if self.env is not None:
             self._make_searcher(self.env, settings)
 
+    @property
+    def _is_set_up(self) -> bool:
+        return vars(self).get("_schedule") is not None
+
+    def _follow_settings(self) -> None:
+        settings, schedule = self._checked_settings()
+        check_learned_model(self)
+        if self._simulated_batches is not None and self.replay_buffer is not None:
+            self._simulated_batches.check_settings()
+        if self._searcher is not None and not self._searcher.follow(settings):
+            assert self.env is not None
+            self._make_searcher(self.env, settings)
+        if self.recent_actions is None and settings.proposal_dims is not None:
+            self.recent_actions = (
+                RecentActions(get_action_dim(self.action_space))
+                if self._searcher is None
+                else self._searcher.recent_actions
+            )
+        assert self._schedule is not None
+        self._schedule.settings = schedule
+        if self.env is not None:
+            self._explore_where_not_searched()
+
     def _make_searcher(self, env: VecEnv, settings: SearchSettings) -> None:
-        if self._searcher is not None:
-            self._searcher.close()
+        before, self._decision, self._rollouts = self._searcher, None, None
         # What this environment's VecNormalize does is what the critics learn from.
         normalizer = unwrap_vec_normalize(env)
         normalize_reward = normalizer is not None and normalizer.norm_reward
         self._searcher = make_searcher(self, env, settings, normalize_reward, self.recent_actions)
+        if before is not None:
+            before.close()
         if self._simulated_batches is not None:
             self._simulated_batches.connect()
         if self.verbose >= 1:
@@ -285,15 +305,20 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
     def collect_rollouts(self, env: VecEnv, *args: Any, **kwargs: Any) -> RolloutReturn:
         if self._checked_env is None or self._checked_env.venv is not env:
             self._checked_env = CheckedVecEnv(env)
+        self._leave_out_unstored()  # of a training that goes on in another agent, if a callback copied it
         try:
             return super().collect_rollouts(self._checked_env, *args, **kwargs)
         finally:
             # SB3 does not store the step in which a callback stops the training, but training may go on.
-            if self._checked_env.unstored is not None:
-                new_obs, reward, dones = self._checked_env.unstored
-                self._note_step(reward, dones)
-                assert self.replay_buffer is not None
-                leave_out_step(self, self.replay_buffer, new_obs)
+            self._leave_out_unstored()
+
+    def _leave_out_unstored(self) -> None:
+        assert self._checked_env is not None
+        if self._checked_env.unstored is not None:
+            new_obs, reward, dones = self._checked_env.unstored
+            self._note_step(reward, dones)
+            assert self.replay_buffer is not None
+            leave_out_step(self, self.replay_buffer, new_obs)
 
     def _setup_learn(
         self,
@@ -303,8 +328,8 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         *args: Any,
         **kwargs: Any,
     ) -> tuple[int, BaseCallback]:
-        if not self.schedule_settings.searches_always or self.learned_model is not None:
-            self._noise_without_search = noise_without_search(self, self.beam_noise)
+        self._noise_without_search = None
+        self._explore_where_not_searched()
         if self.action_noise_after_search and self.action_noise is None:
             raise ValueError(
                 "action_noise_after_search adds action_noise to searched actions, and there is none: pass an "
@@ -313,15 +338,23 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         if self.learned_model is not None:
             assert self.replay_buffer is not None
             self.learned_model.check_room(self.replay_buffer)
+        assert self._simulated_batches is not None
+        self._simulated_batches.begin()
         will_reset = reset_num_timesteps or self._last_obs is None
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args, **kwargs)
         if self._total_timesteps:  # what is known of progress is that of the training before
             self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
         check_observations(self._last_obs)
         if will_reset:
+            self._checked_env = None
             assert self._schedule is not None
             self._schedule.begin_episodes(self.n_envs, self.num_timesteps)
         return result
+
+    def _explore_where_not_searched(self) -> None:
+        if not self.schedule_settings.searches_always or self.learned_model is not None:
+            known = self._noise_without_search is not None
+            self._noise_without_search = noise_without_search(self, self.beam_noise, say=not known)
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
         """
@@ -391,6 +424,21 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
             return super().learn(
                 total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
             )
+
+    @classmethod
+    def load(cls: type[SelfMCBS], path: Any, *args: Any, **kwargs: Any) -> SelfMCBS:
+        """
+        Load the model from a zip-file, as SB3 does.
+
+        :param path: path to the file, or a file-like object
+        :param args: the other parameters of SB3's ``load``
+        :param kwargs: the same, and settings that replace those in the file; a ``preset`` replaces all of how
+            is searched, except for settings beside it
+        :return: the model
+        """
+        if kwargs.get("preset") is not None:
+            kwargs = {**settings_of_preset(kwargs["preset"]), **kwargs}
+        return super().load(path, *args, **kwargs)
 
     @classmethod
     def resume(cls: type[SelfMCBS], path: str, env: GymEnv | None = None, **kwargs: Any) -> SelfMCBS:

@@ -4,47 +4,63 @@ For the small networks of continuous control those calls cost as much as the mat
 here is stored ``[features, rows]``: products in this order are quicker for few rows.
 """
 
-from collections.abc import Iterable
 from typing import Any
 
 import torch as th
 from torch import nn
 
 
-def _flatten(modules: Iterable[nn.Module]) -> list[nn.Module]:
-    layers: list[nn.Module] = []
-    for module in modules:
-        layers += _flatten(module) if type(module) is nn.Sequential else [module]
-    return layers
+def own_state(module: nn.Module) -> dict[str, Any]:
+    """A module's attributes, if calling it does what its class says and nothing else.
+
+    :param module: the module.
+    :raises TypeError: if there are hooks, or something else is called in place of the class's method.
+    """
+    state = vars(module)
+    if (
+        state["_forward_hooks"]
+        or state["_forward_pre_hooks"]
+        or state["_backward_hooks"]
+        or state["_backward_pre_hooks"]
+        or "forward" in state
+        or "_call_impl" in state
+        or state.get("_compiled_call_impl") is not None
+    ):
+        raise TypeError(
+            f"a {type(module).__name__} has hooks, was compiled, or has a replaced forward method"
+        )
+    return state
 
 
 class _Linear:
-    """A linear layer's parameters, apart from autograd.
+    """A linear layer's parameters as they are now.
 
-    :param layer: the layer; a later change of its parameters' storage, as by ``to(device)``, is followed.
+    :param layer: the layer.
+    :raises TypeError: if it is more than a weight and a bias in float32.
+
+    :ivar weight: ``[out_features, in_features]``.
+    :ivar bias: ``[out_features]`` or None.
     """
 
+    __slots__ = ("_column", "bias", "weight")
+
     def __init__(self, layer: nn.Linear) -> None:
-        self._parameters: dict[str, Any] = layer._parameters
-        self._weight = self._bias = th.empty(0)
+        state = own_state(layer)
+        parameters = state["_parameters"]
+        if [*parameters] != ["weight", "bias"] or state["_modules"]:
+            raise TypeError("a Linear has other parameters than its weight and bias (it may be pruned)")
+        self.weight, self.bias = parameters["weight"], parameters["bias"]
+        self._column: th.Tensor | None = None
+        _check_parameter(self.weight)
+        if self.bias is not None:
+            _check_parameter(self.bias)
 
     @property
-    def weight(self) -> th.Tensor:
-        """``[out_features, in_features]``."""
-        present = self._parameters["weight"]
-        if self._weight.data_ptr() != present.data_ptr():
-            self._weight = present.detach()
-        return self._weight
-
-    @property
-    def bias(self) -> th.Tensor | None:
-        """``[out_features, 1]``."""
-        present = self._parameters["bias"]
-        if present is None:
-            return None
-        if self._bias.data_ptr() != present.data_ptr():
-            self._bias = present.detach().unsqueeze(1)
-        return self._bias
+    def column(self) -> th.Tensor:
+        """The bias as ``[out_features, 1]``."""
+        if self._column is None:
+            self._column = self.bias.unsqueeze(1)
+        return self._column
 
     def set_gradients(self, layer_input: th.Tensor, gradient: th.Tensor) -> None:
         """Set the parameters' ``grad``.
@@ -52,10 +68,14 @@ class _Linear:
         :param layer_input: ``[in_features, rows]``.
         :param gradient: of the loss, by the layer's output: ``[out_features, rows]``.
         """
-        weight, bias = self._parameters["weight"], self._parameters["bias"]
-        th.mm(gradient, layer_input.t(), out=_gradient_of(weight))
-        if bias is not None:
-            th.sum(gradient, 1, out=_gradient_of(bias))
+        th.mm(gradient, layer_input.t(), out=_gradient_of(self.weight))
+        if self.bias is not None:
+            th.sum(gradient, 1, out=_gradient_of(self.bias))
+
+
+def _check_parameter(parameter: th.Tensor) -> None:
+    if type(parameter) is not nn.Parameter or parameter.dtype != th.float32 or not parameter.is_contiguous():
+        raise TypeError("parameters are not float32, not contiguous, or of a class of their own")
 
 
 def _gradient_of(parameter: nn.Parameter) -> th.Tensor:
@@ -65,24 +85,57 @@ def _gradient_of(parameter: nn.Parameter) -> th.Tensor:
 
 
 class MLP:
-    """Linear layers with ReLU and Tanh between them. Nothing here is recorded by autograd.
+    """Linear layers with ReLU and Tanh between them, to be called without autograd.
 
-    :param modules: ``nn.Sequential``s and single layers; their present parameters are used at every call.
-    :raises TypeError: if a layer is of another kind.
+    It knows the layers and parameters that there are when it is made, and does not follow when others take
+    their places.
+
+    :param modules: ``nn.Sequential``s and single layers.
+    :raises TypeError: if a layer is of another kind, or more than calling it would do was asked of it.
     """
 
     def __init__(self, *modules: nn.Module) -> None:
         self._layers: list[_Linear | type[nn.Module]] = []
-        for layer in _flatten(modules):
-            if type(layer) is nn.Linear:
-                self._layers.append(_Linear(layer))
-            elif type(layer) in (nn.ReLU, nn.Tanh) and self._layers:
-                self._layers.append(type(layer))
-            else:
-                raise TypeError(
-                    f"{type(layer).__name__} is not covered; an MLP begins with Linear and goes on with "
-                    "Linear, ReLU and Tanh"
-                )
+        for module in modules:
+            self._append(module)
+        if not self._layers:
+            raise TypeError("there are no layers")
+
+    def _append(self, module: nn.Module) -> None:
+        if type(module) is nn.Linear:
+            self._layers.append(_Linear(module))
+            return
+        is_activation = type(module) in (nn.ReLU, nn.Tanh) and self._layers
+        if type(module) is not nn.Sequential and not is_activation:
+            raise TypeError(
+                f"{type(module).__name__} is not covered; an MLP begins with Linear and goes on with Linear, "
+                "ReLU and Tanh"
+            )
+        state = own_state(module)
+        if state["_parameters"] or (is_activation and state["_modules"]):
+            raise TypeError(f"a {type(module).__name__} has parameters")
+        if is_activation:
+            self._layers.append(type(module))
+        for layer in state["_modules"].values():
+            self._append(layer)
+
+    @property
+    def device(self) -> th.device:
+        """Where the first layer is."""
+        first = self._layers[0]
+        assert isinstance(first, _Linear)
+        return first.weight.device
+
+    @property
+    def parameters(self) -> list[nn.Parameter]:
+        """In the order of the layers."""
+        found = []
+        for layer in self._layers:
+            if isinstance(layer, _Linear):
+                found.append(layer.weight)
+                if layer.bias is not None:
+                    found.append(layer.bias)
+        return found
 
     def __call__(self, x: th.Tensor) -> th.Tensor:
         """Run all layers.
@@ -102,9 +155,8 @@ class MLP:
         for layer in self._layers:
             if isinstance(layer, _Linear):
                 x = th.mm(layer.weight, x)
-                bias = layer.bias
-                if bias is not None:
-                    x += bias
+                if layer.bias is not None:
+                    x += layer.column
             else:
                 x = x.relu_() if layer is nn.ReLU else x.tanh_()
             outputs.append(x)

@@ -8,20 +8,14 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from sb3_contrib import TQC
-from sb3_contrib.tqc.policies import Actor as TQCActor
-from sb3_contrib.tqc.policies import Critic as TQCCritic
 from stable_baselines3 import DDPG, SAC, TD3
 from stable_baselines3.common.distributions import TanhBijector
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.policies import ContinuousCritic
-from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.torch_layers import FlattenExtractor
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import obs_as_tensor
-from stable_baselines3.sac.policies import Actor as SACActor
-from stable_baselines3.td3.policies import Actor as TD3Actor
-from torch import nn
 
 from sb3_mcbs.algorithms.mlp import MLP
+from sb3_mcbs.algorithms.plain_networks import actor_mlp, critic_mlps
 from sb3_mcbs.models.base import Observations
 from sb3_mcbs.search import SearchSettings
 
@@ -91,59 +85,12 @@ def entropy_coefficient(agent: OffPolicyAlgorithm) -> float:
     return agent.ent_coef_tensor.item()
 
 
-def _check_plain(network: Any) -> None:
-    """Refuse an actor or critic that does more than flatten observations and call its layers."""
-    space = network.observation_space
-    if not isinstance(space, spaces.Box) or (network.normalize_images and is_image_space(space)):
-        raise TypeError("observations are not vectors of numbers")
-    if type(network.features_extractor) is not FlattenExtractor:
-        raise TypeError(f"features are extracted by a {type(network.features_extractor).__name__}")
-    for module in network.modules():
-        hooks = module._forward_hooks or module._forward_pre_hooks or module._backward_hooks
-        if hooks or "forward" in vars(module):
-            raise TypeError(f"a {type(module).__name__} has hooks or a replaced forward method")
-
-
-def actor_mlp(actor: Any) -> MLP:
-    """An actor's deterministic action as an MLP.
-
-    :param actor: an SB3 actor.
-    :return: float32 observations ``[obs_dim, rows]`` -> actions ``[act_dim, rows]`` in [-1, 1].
-    :raises TypeError: if the actor is more than an MLP.
-    """
-    _check_plain(actor)
-    if type(actor) is TD3Actor:
-        return MLP(actor.mu)
-    if type(actor) in (SACActor, TQCActor) and not actor.use_sde:
-        return MLP(actor.latent_pi, actor.mu, nn.Tanh())
-    raise TypeError(f"{type(actor).__name__} is not an actor of a known kind")
-
-
-def critic_mlps(critic: Any) -> list[MLP]:
-    """The single networks of a critic.
-
-    :param critic: an SB3 critic.
-    :return: each: float32 observations above actions ``[obs_dim + act_dim, rows]`` -> ``[1, rows]`` or
-        quantiles ``[n_quantiles, rows]``.
-    :raises TypeError: if the critic is more than MLPs.
-    """
-    _check_plain(critic)
-    if type(critic) not in (ContinuousCritic, TQCCritic):
-        raise TypeError(f"{type(critic).__name__} is not a critic of a known kind")
-    return [MLP(network) for network in critic.q_networks]
-
-
-def _if_plain(make: Callable[[Any], _T]) -> Callable[[Any], _T | None]:
-    """``make``, with None for a network that it refuses; asked again only when there is another network."""
-
-    @functools.lru_cache(maxsize=1)
-    def made(network: Any) -> _T | None:
-        try:
-            return make(network)
-        except TypeError:
-            return None
-
-    return made
+def _if_plain(make: Callable[[Any], _T], network: Any) -> _T | None:
+    """``make(network)``, or None for a network that it refuses."""
+    try:
+        return make(network)
+    except TypeError:
+        return None
 
 
 def _columns(first: np.ndarray, second: np.ndarray | None, device: th.device) -> th.Tensor:
@@ -167,27 +114,32 @@ def _to_numpy(tensor: th.Tensor, device: th.device) -> np.ndarray:
 def policy_function(agent: OffPolicyAlgorithm, target: bool = False) -> Callable[[Observations], np.ndarray]:
     """The actor without exploration: its output (TD3, DDPG) or its squashed mean (SAC, TQC).
 
-    :param agent: a supported agent; its present networks are used at every call.
-    :param target: the target actor's, where there is one.
+    :param agent: a supported agent. Its networks are those of now: make this function for every search.
+    :param target: for training instead of acting: the target actor where there is one.
     :return: observations ``[rows, *obs_shape]`` -> float32 actions ``[rows, act_dim]`` in [-1, 1].
     """
-    policy_network: Any = agent.policy
+    own: Any = agent
     stochastic = isinstance(agent, SAC | TQC)
-    name = "actor_target" if target and not stochastic else "actor"
-    mlp_of = _if_plain(actor_mlp)
+    # SB3 trains what the agent holds, and acts with what its policy holds.
+    actor = own.policy.actor if not target else own.actor if stochastic else own.actor_target
+    mlp = _if_plain(actor_mlp, actor)
+    if mlp is not None:
+        return functools.partial(_actions, mlp)
+    device = agent.device if target else agent.policy.device
+    if not target:
+        agent.policy.set_training_mode(False)
+    arguments = {"deterministic": True} if stochastic else {}
 
     def policy(observations: Observations) -> np.ndarray:
-        actor = getattr(policy_network, name)
-        mlp = mlp_of(actor)
-        if mlp is not None:
-            assert isinstance(observations, np.ndarray)
-            return _to_numpy(mlp(_columns(observations, None, agent.device)), agent.device).T
         with th.no_grad():
-            tensor = obs_as_tensor(observations, agent.device)
-            actions = actor(tensor, deterministic=True) if stochastic else actor(tensor)
-            return actions.cpu().numpy()
+            return actor(obs_as_tensor(observations, device), **arguments).cpu().numpy()
 
     return policy
+
+
+def _actions(mlp: MLP, observations: np.ndarray) -> np.ndarray:
+    with th.no_grad():
+        return _to_numpy(mlp(_columns(observations, None, mlp.device)), mlp.device).T
 
 
 def value_function(
@@ -195,37 +147,39 @@ def value_function(
 ) -> Callable[[Observations, np.ndarray], np.ndarray]:
     """The online critics' estimate: the minimum over critics, or TQC's mean over quantiles.
 
-    :param agent: a supported agent; its present networks are used at every call.
+    :param agent: a supported agent. Its networks are those of now: make this function for every search.
     :param tqc_value: which quantiles, see :class:`~sb3_mcbs.SearchSettings`.
     :return: observations ``[rows, *obs_shape]``, scaled actions ``[rows, act_dim]`` -> ``[rows]``.
     """
-    policy_network: Any = agent.policy
+    policy: Any = agent.policy
+    critic = policy.critic
     quantiles = isinstance(agent, TQC)
 
-    def mean_quantile(quantiles: th.Tensor, critic: Any) -> th.Tensor:
+    def mean_quantile(quantiles: th.Tensor) -> th.Tensor:
         # ``[quantiles of all critics, rows]``
         if tqc_value == "truncated":
             n_dropped = agent.top_quantiles_to_drop_per_net * critic.n_critics  # type: ignore[attr-defined]
             quantiles = quantiles.sort(dim=0).values[: len(quantiles) - n_dropped]
         return quantiles.mean(dim=0)
 
-    mlps_of = _if_plain(critic_mlps)
+    mlps = _if_plain(critic_mlps, critic)
+    if mlps is None:
+        policy.set_training_mode(False)
+    device = policy.device if mlps is None else mlps[0].device
 
     def value(observations: Observations, actions: np.ndarray) -> np.ndarray:
-        critic = policy_network.critic
-        mlps = mlps_of(critic)
-        if mlps is not None:
-            assert isinstance(observations, np.ndarray)
-            inputs = _columns(observations, actions, agent.device)
-            columns = [mlp(inputs) for mlp in mlps]
-            if quantiles:
-                return _to_numpy(mean_quantile(th.cat(columns), critic), agent.device)
-            return _to_numpy(functools.reduce(th.minimum, columns)[0], agent.device)
         with th.no_grad():
-            tensor = obs_as_tensor(observations, agent.device)
-            estimates = critic(tensor, th.as_tensor(actions, device=agent.device))
+            if mlps is not None:
+                assert isinstance(observations, np.ndarray)
+                inputs = _columns(observations, actions, device)
+                columns = [mlp(inputs) for mlp in mlps]
+                if quantiles:
+                    return _to_numpy(mean_quantile(th.cat(columns)), device)
+                return _to_numpy(functools.reduce(th.minimum, columns)[0], device)
+            tensor = obs_as_tensor(observations, device)
+            estimates = critic(tensor, th.as_tensor(actions, device=device))
             if quantiles:
-                return mean_quantile(estimates.flatten(1).t(), critic).cpu().numpy()
+                return mean_quantile(estimates.flatten(1).t()).cpu().numpy()
             return th.cat(estimates, dim=1).amin(dim=1).cpu().numpy()
 
     return value
@@ -234,16 +188,17 @@ def value_function(
 def entropy_function(agent: OffPolicyAlgorithm) -> Callable[[Observations, np.ndarray], np.ndarray]:
     """What actions add to the soft value: ``-ent_coef * log pi(a|s)``.
 
-    :param agent: a SAC or TQC agent; its present actor and entropy coefficient are used at every call.
+    :param agent: a SAC or TQC agent. Its actor is that of now: make this function for every search.
     :return: observations ``[rows, *obs_shape]``, scaled actions ``[rows, act_dim]`` -> ``[rows]``.
     """
-    policy_network: Any = agent.policy
+    policy: Any = agent.policy
+    actor, device = policy.actor, policy.device
+    policy.set_training_mode(False)
 
     def bonus(observations: Observations, actions: np.ndarray) -> np.ndarray:
-        actor = policy_network.actor
         with th.no_grad():
-            distribution = _distribution(actor, obs_as_tensor(observations, agent.device))
-            squashed = th.as_tensor(actions, device=agent.device)
+            distribution = _distribution(actor, obs_as_tensor(observations, device))
+            squashed = th.as_tensor(actions, device=device)
             mean = distribution.distribution.mean
             # Where tanh is saturated its inverse is a guess; that of the policy's own action is known.
             latent = th.where(squashed == th.tanh(mean), mean, TanhBijector.inverse(squashed))
@@ -256,26 +211,49 @@ def entropy_function(agent: OffPolicyAlgorithm) -> Callable[[Observations, np.nd
 def soft_policy_function(
     agent: OffPolicyAlgorithm,
 ) -> Callable[[Observations, np.random.Generator], tuple[np.ndarray, np.ndarray]]:
-    """The stochastic actor, drawn from with a generator of one's own, and what its entropy adds to the value.
+    """The stochastic actor that is trained, drawn from with a generator of one's own, and its entropy.
 
-    :param agent: a SAC or TQC agent; its present actor and entropy coefficient are used at every call.
+    :param agent: a SAC or TQC agent. Its actor is that of now: make this function for every batch.
     :return: observations ``[rows, *obs_shape]``, generator -> float32 actions ``[rows, act_dim]`` in [-1, 1],
-        and ``-ent_coef * log pi(a|s)`` of each, ``[rows]``.
+        and what each adds to the value, ``-ent_coef * log pi(a|s)``, ``[rows]``.
     """
-    policy_network: Any = agent.policy
+    own: Any = agent
+    actor, device = own.actor, agent.device
 
     def draw(observations: Observations, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        actor = policy_network.actor
         with th.no_grad():
-            distribution = _distribution(actor, obs_as_tensor(observations, agent.device))
+            distribution = _distribution(actor, obs_as_tensor(observations, device))
             normal = distribution.distribution
             noise = rng.standard_normal(tuple(normal.mean.shape), dtype=np.float32)
-            latent = normal.mean + normal.stddev * th.as_tensor(noise, device=agent.device)
+            latent = normal.mean + normal.stddev * th.as_tensor(noise, device=device)
             actions = th.tanh(latent)
             log_prob = _log_prob(actor, distribution, actions, latent)
             return actions.cpu().numpy(), (-entropy_coefficient(agent) * log_prob).cpu().numpy()
 
     return draw
+
+
+def unscale_function(agent: OffPolicyAlgorithm) -> Callable[[np.ndarray], np.ndarray]:
+    """What turns scaled actions into actions of the environment.
+
+    :param agent: a supported agent. Its policy is that of now: make this function for every search.
+    :return: ``[rows, act_dim]`` in [-1, 1] -> ``[rows, *act_shape]``.
+    """
+    policy: Any = agent.policy
+    space = policy.action_space
+    is_sb3s = getattr(type(policy), "unscale_action", None) is BasePolicy.unscale_action
+    if not is_sb3s or "unscale_action" in vars(policy) or space.dtype != np.float32:
+        return lambda actions: policy.unscale_action(actions.reshape(-1, *space.shape))
+    low, half_range = space.low, 0.5 * (space.high - space.low)
+
+    def unscale(actions: np.ndarray) -> np.ndarray:
+        # SB3's formula, low + 0.5 * (action + 1) * (high - low), to the bit: halving rounds nothing.
+        unscaled = actions.reshape(-1, *space.shape) + 1.0
+        unscaled *= half_range
+        unscaled += low
+        return unscaled
+
+    return unscale
 
 
 def _distribution(actor: Any, observations: Any) -> Any:

@@ -3,6 +3,7 @@
 import operator
 from copy import deepcopy
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -11,10 +12,14 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.preprocessing import maybe_transpose
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
+from sb3_mcbs.algorithms.keywords import settings_of_preset
 from sb3_mcbs.algorithms.learned_search import make_searcher
 from sb3_mcbs.algorithms.mcbs import MCBS
 from sb3_mcbs.search import SearchResult, SearchSettings, with_preset
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
+
+#: What is not simply replaced when it is set.
+_HELD = ("model", "vec_env", "settings")
 
 
 class SearchPolicy:
@@ -28,7 +33,9 @@ class SearchPolicy:
         evaluate_policy(policy, vec_env)
 
     SAC and TQC propose their mean action; TQC's value is the mean over quantiles that ``tqc_value`` says.
-    Attributes that this class does not have are those of the agent (``save``, ``get_env``, ``logger``, ...).
+    Settings are attributes: one that is set (``policy.beam_width = 20``) holds from the next decision on, and
+    ``policy.settings = ...`` sets them all. Attributes that this class does not have are those of the agent
+    (``save``, ``get_env``, ``logger``, ...).
 
     :param model: a TD3, DDPG, SAC or TQC agent, or one that searched in training (
         :class:`~sb3_mcbs.MCBS`)
@@ -72,6 +79,43 @@ class SearchPolicy:
         recent_actions = deepcopy(model.recent_actions) if isinstance(model, MCBS) else None
         self.searcher = make_searcher(model, self.vec_env, self.settings, normalize_reward, recent_actions)
 
+    def _follow_settings(self) -> None:
+        """Search with the present settings from the next decision on."""
+        before = self.searcher
+        if before.follow(self.settings):
+            return
+        make = partial(make_searcher, self.model, self.vec_env, self.settings)
+        self.searcher = make(before.normalize_reward, before.recent_actions)
+        before.close()
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        attributes = vars(self)
+        if "searcher" not in attributes or (name in attributes and name not in _HELD):
+            super().__setattr__(name, value)
+        elif name in ("model", "vec_env"):
+            raise AttributeError(f"The {name} of a SearchPolicy cannot be exchanged: make another one.")
+        elif name == "settings":
+            self._change_settings(value)
+        elif name == "preset":
+            self.settings = replace(self.settings, **_of_the_search(settings_of_preset(value)))
+        elif name in SearchSettings.names():
+            self.settings = replace(self.settings, **{name: value})
+        elif hasattr(self.model, name):
+            setattr(self.model, name, value)
+        else:
+            super().__setattr__(name, value)
+
+    def _change_settings(self, settings: SearchSettings) -> None:
+        if not isinstance(settings, SearchSettings):
+            raise TypeError(f"Expected SearchSettings, got {settings!r}.")
+        before, vars(self)["settings"] = self.settings, settings
+        try:
+            self._follow_settings()
+        except Exception:
+            vars(self)["settings"] = before
+            self._follow_settings()
+            raise
+
     def predict(
         self,
         observation: np.ndarray | dict[str, np.ndarray],
@@ -102,9 +146,13 @@ class SearchPolicy:
         self.searcher.close()
 
     def __getattr__(self, name: str) -> Any:
-        if name == "model" or name.startswith("__"):
+        if name in ("model", "settings") or name.startswith("__"):
             raise AttributeError(name)
-        return getattr(self.model, name)
+        return getattr(self.settings if name in SearchSettings.names() else self.model, name)
+
+
+def _of_the_search(settings: dict[str, Any]) -> dict[str, Any]:
+    return {name: settings[name] for name in SearchSettings.names() if name in settings}
 
 
 def _as_vec_env(env: VecEnv | gym.Env) -> VecEnv:

@@ -1,7 +1,6 @@
 """Joins an agent's networks, the environments it acts in and a forward model to a search."""
 
 import logging
-import os
 import time
 import warnings
 from collections import defaultdict
@@ -10,27 +9,28 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import get_action_dim
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_mcbs.algorithms.faults import check_networks, check_observations, is_finite
+from sb3_mcbs.algorithms.faults import InvalidDecisions, check_networks, check_observations, is_finite
 from sb3_mcbs.algorithms.networks import (
     check_agent,
     check_values,
     entropy_function,
     policy_function,
+    unscale_function,
     value_function,
 )
 from sb3_mcbs.algorithms.observations import difference, equal, n_rows, row_of
-from sb3_mcbs.algorithms.torch_settings import go_on_in_process, matmul_precision, one_thread
+from sb3_mcbs.algorithms.own_environments import InOwnEnvironments
+from sb3_mcbs.algorithms.torch_settings import matmul_precision, one_thread
 from sb3_mcbs.algorithms.vec_env_view import (
     AgentView,
     VecEnvView,
     reward_normalizer,
     snapshot_environments,
 )
-from sb3_mcbs.models import Environments, ForwardModel, ForwardModelError, make_forward_model
+from sb3_mcbs.models import Environments, ForwardModelError, make_forward_model
 from sb3_mcbs.models.base import Observations
 from sb3_mcbs.models.copies import stack
 from sb3_mcbs.search import (
@@ -52,7 +52,7 @@ from sb3_mcbs.snapshot import SnapshotEnvWrapper
 logger = logging.getLogger("sb3_mcbs")
 
 
-class Searcher:
+class Searcher(InOwnEnvironments):
     """Searches for an agent from the present states of the environments that it acts in.
 
     :param agent: a TD3, DDPG, SAC or TQC agent.
@@ -74,48 +74,69 @@ class Searcher:
         normalize_reward: bool | None = None,
         recent_actions: RecentActions | None = None,
     ) -> None:
+        super().__init__()
         check_agent(agent)
-        check_values(agent, settings)
-        self.agent = agent
+        self.agent, self._vec_env, self.normalize_reward = agent, vec_env, normalize_reward
         self.settings = settings
-        self._action_shape = agent.action_space.shape or ()
         self._act_dim = get_action_dim(agent.action_space)
-        if (settings.proposal_dims or 0) > self._act_dim:
-            raise ValueError(
-                f"proposal_dims must be at most {self._act_dim}, the entries of an action here; got "
-                f"{settings.proposal_dims}."
-            )
+        self._check(settings)
         self.recent_actions = RecentActions(self._act_dim) if recent_actions is None else recent_actions
-        space: Any = agent.action_space
-        known = type(agent.policy).unscale_action is BasePolicy.unscale_action and space.dtype == np.float32
-        self._low, self._half_range = space.low, 0.5 * (space.high - space.low) if known else None
-        self.model: ForwardModel | None = None
+        self.model = None
         self._previous_step_differed = False
+        self._invalid_decisions = InvalidDecisions()
         #: Rounds of other sizes take other times.
         self._paces: defaultdict[tuple[int, int], Pace] = defaultdict(Pace)
         self._plans: PlanMemory | None = None
         self.view: AgentView
         if settings.rollout_depth > 0:
-            self._connect(vec_env, normalize_reward)
-            assert self.model is not None
+            self._connect()
+            # What it was found out from may have changed when a copy connects.
+            self.normalize_reward = self.view.reward_normalizer is not None
+        self._take_over(settings)
+
+    def _check(self, settings: SearchSettings) -> None:
+        check_values(self.agent, settings)
+        if (settings.proposal_dims or 0) > self._act_dim:
+            raise ValueError(
+                f"proposal_dims must be at most {self._act_dim}, the entries of an action here; got "
+                f"{settings.proposal_dims}."
+            )
+
+    def follow(self, settings: SearchSettings) -> bool:
+        """Search with other settings from the next decision on.
+
+        :param settings: the settings.
+        :return: False if another forward model is to simulate; nothing has changed then.
+        :raises ValueError: if they make no sense with the agent, its actions or the environments' dynamics.
+        """
+        if settings == self.settings:
+            return True
+        self._check(settings)
+        if _simulators_settings(settings) != _simulators_settings(self.settings):
+            return False
+        self._take_over(settings)
+        return True
+
+    def _take_over(self, settings: SearchSettings) -> None:
+        if self.model is not None:
             check_dynamics(settings, self.model.deterministic)
-            if settings.strategy == "refine":
-                self._plans = PlanMemory(len(self._all_envs), settings.horizon, self._act_dim)
-        self._functions = self._agent_functions()
-        self._process = os.getpid()
+        plans = self._plans
+        if settings.strategy != "refine":
+            plans = None
+        elif plans is None or settings.horizon != self.settings.horizon:
+            plans = PlanMemory(len(self._all_envs), settings.horizon, self._act_dim)
+        self.settings, self._plans = settings, plans
 
-    def go_on_here(self) -> None:
-        """Notice a fork of the process since this object was made."""
-        self._process = go_on_in_process(self._process)
-
-    def _connect(self, vec_env: VecEnv, normalize_reward: bool | None) -> None:
-        """Make the forward model, and the view of the environments."""
-        agent, settings = self.agent, self.settings
-        view = VecEnvView(vec_env, reward_normalizer(agent.get_env(), vec_env, normalize_reward))
+    def _connect(self) -> None:
+        settings = self.settings
+        view = VecEnvView(self._vec_env, self._reward_normalizer())
         self.view = view
         self.environments: Environments = snapshot_environments(view.base)
         self._all_envs = range(len(self.environments))
         self.model = make_forward_model(self.environments, settings.forward_model, settings.n_threads)
+
+    def _reward_normalizer(self) -> VecNormalize | None:
+        return reward_normalizer(self.agent.get_env(), self._vec_env, self.normalize_reward)
 
     @property
     def ready(self) -> bool:
@@ -179,6 +200,7 @@ class Searcher:
                 )
         if result.invalid_rollouts or not is_finite(result.actions):
             check_networks(agent.policy, agent.value, observations)
+        self._invalid_decisions.note(result, self.model)
         return self._as_replay_buffers_keep_them(result) if record else result
 
     def check_networks(self, observations: Observations) -> None:
@@ -272,33 +294,29 @@ class Searcher:
             return
         if self._plans is not None and memory.get("plans") is not None:
             self._plans.set_state(memory["plans"], self._moments(self._all_envs))
-        if self.model.kind != memory["kind"]:
+        self._go_on_with(memory["kind"], memory["deterministic"])
+
+    def _go_on_with(self, kind: str, deterministic: bool) -> None:
+        assert self.model is not None
+        if self.model.kind != kind:
             self.model.close()
-            self.model = make_forward_model(self.environments, memory["kind"], self.settings.n_threads)
+            self.model = make_forward_model(self.environments, kind, self.settings.n_threads)
         elif self.model.kind != "pool":
             self.model.refresh()  # the environments' simulators have other values than when it was made
-        self.model.deterministic = memory["deterministic"]
-
-    def close(self) -> None:
-        """Release the forward model."""
-        if self.model is not None:
-            self.model.close()
+        self.model.deterministic = deterministic
 
     def agent_functions(self) -> Agent:
-        """The agent as the search knows it: functions of the environments' own observations."""
-        return self._functions._replace(gamma=self.agent.gamma)
-
-    def _agent_functions(self) -> Agent:
+        """The agent as it is now, as a search knows it: functions of the environments' own observations."""
         policy, gamma = policy_function(self.agent), self.agent.gamma
-        value = value_function(self.agent, self.settings.tqc_value)
+        value, unscale = value_function(self.agent, self.settings.tqc_value), unscale_function(self.agent)
         if self.model is None:
-            return Agent(policy, value, gamma, self.unscale, lambda rewards: rewards)
+            return Agent(policy, value, gamma, unscale, lambda rewards: rewards)
         observe = self.view.observe
         agent = Agent(
             policy=lambda observations: policy(observe(observations)),
             value=lambda observations, actions: value(observe(observations), actions),
             gamma=gamma,
-            unscale_action=self.unscale,
+            unscale_action=unscale,
             scale_reward=self.view.scale_reward,
         )
         if not self.settings.entropy_bonus:
@@ -314,14 +332,7 @@ class Searcher:
         :param actions: ``[rows, act_dim]`` in [-1, 1].
         :return: ``[rows, *act_shape]``.
         """
-        actions = actions.reshape(-1, *self._action_shape)
-        if self._half_range is None:
-            return self.agent.policy.unscale_action(actions)
-        # SB3's formula, low + 0.5 * (action + 1) * (high - low), to the bit: halving rounds nothing.
-        unscaled = actions + 1.0
-        unscaled *= self._half_range
-        unscaled += self._low
-        return unscaled
+        return unscale_function(self.agent)(actions)
 
     def _look(self, observations: Observations, envs: Sequence[int]) -> tuple[list[Any], Observations]:
         """Where the rollouts start: roots, and the observations there as the forward model has them.
@@ -347,8 +358,10 @@ class Searcher:
             raise ValueError(
                 "The observations to act on are not those of the environments' present states. A search "
                 "plans from the environments it was given: act in those, step them only through their "
-                "SnapshotEnvWrapper, and keep wrappers that alter observations inside it. If they were used "
-                "for something else between two calls of learn, call set_env before the second."
+                "SnapshotEnvWrapper, and keep wrappers that alter observations inside it. A callback needs "
+                "environments of its own: EvalCallback(make_vec_env(...)), not "
+                "EvalCallback(model.get_env()). If they were used for something else between two calls of "
+                "learn, call set_env before the second."
             )
         return stacked
 
@@ -407,6 +420,11 @@ class Searcher:
     def _warn(message: str) -> None:
         logger.warning(message)
         warnings.warn(message, stacklevel=4)
+
+
+def _simulators_settings(settings: SearchSettings) -> tuple[Any, ...]:
+    """What the forward model is made with."""
+    return settings.forward_model, settings.n_threads, settings.rollout_depth > 0
 
 
 def _last_observation(env: SnapshotEnvWrapper) -> Any:

@@ -1,5 +1,6 @@
 """What an agent learns from simulations besides its own transitions."""
 
+import logging
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
@@ -9,6 +10,8 @@ from sb3_mcbs.algorithms.mixed_batches import Part, mixed_batches
 from sb3_mcbs.algorithms.rollout_replay import RolloutReplay, RolloutReplaySettings
 from sb3_mcbs.algorithms.value_expansion import ValueExpansion, ValueExpansionSettings
 from sb3_mcbs.search import Rollouts
+
+logger = logging.getLogger("sb3_mcbs")
 
 
 class SimulatedBatches:
@@ -23,21 +26,61 @@ class SimulatedBatches:
 
     def __init__(self, agent: Any) -> None:
         self._agent = agent
+        self._check()
+        self._expansion: ValueExpansion | None = None
+        self._expansion_of: tuple[Any, Any] | None = None
+        self._kept = self._to_be_kept()
+        self._rollout_replay()  # makes room in the buffer
+
+    def _check(self) -> None:
+        agent = self._agent
         RolloutReplaySettings.of(agent).check_search(agent.search_settings)
         expansion = ValueExpansionSettings.of(agent)
         expansion.check_search(agent.search_settings, agent.rollout_replay)
         expansion.check_buffer(agent.replay_buffer.optimize_memory_usage)
-        self._expansion: ValueExpansion | None = None
-        self._expansion_of: tuple[Any, Any] | None = None
-        self._most_rollouts = agent.schedule_settings.most_rollouts(agent.search_settings)
-        self._rollout_replay()  # makes room in the buffer
+
+    def _to_be_kept(self) -> tuple[tuple[int, int] | None, bool]:
+        """How many rollouts of how many steps are kept beside the replay buffer, and whether states are."""
+        agent = self._agent
+        most_rollouts = agent.schedule_settings.most_rollouts(agent.search_settings)
+        return (most_rollouts if agent.rollout_replay else None), agent.value_expansion > 0
+
+    def check_settings(self) -> None:
+        """Refuse changed settings that need other arrays beside the replay buffer than there are.
+
+        :raises TypeError: if a setting has the wrong type.
+        :raises ValueError: if settings do not go together.
+        """
+        self._check()
+        rollouts, states = self._to_be_kept()
+        advice = "save it, and load it with the other settings."
+        if rollouts != self._kept[0]:
+            raise ValueError(
+                "rollout_replay keeps equally many rollouts of equal length beside the replay buffer: "
+                "neither that, nor whether they are kept, can be changed once the agent is made or loaded; "
+                + advice
+            )
+        if states != self._kept[1]:
+            raise ValueError(
+                "value_expansion keeps states beside the replay buffer: it can be changed later, but not "
+                "from or to 0; " + advice
+            )
+
+    def begin(self) -> None:
+        """A training is about to begin: let go of what earlier settings have kept in the replay buffer."""
+        attributes = vars(self._agent.replay_buffer)
+        for kept, prefix in zip(self._kept, ("rollout_", "expansion_"), strict=True):
+            gone = [] if kept else [name for name in attributes if name.startswith(prefix)]
+            for name in gone:
+                del attributes[name]
+            if gone:
+                logger.info("The replay buffer's %s are dropped: no setting uses them.", ", ".join(gone))
 
     def connect(self) -> None:
         """Follow the agent to another searcher.
 
         :raises ForwardModelError: if its forward model is not one to learn from.
         """
-        self._most_rollouts = self._agent.schedule_settings.most_rollouts(self._agent.search_settings)
         self._value_expansion()
 
     def look(self) -> None:
@@ -78,10 +121,8 @@ class SimulatedBatches:
         return mixed_batches(self._agent, parts, self._agent.rollout_rng) if parts else nullcontext()
 
     def _rollout_replay(self) -> RolloutReplay | None:
-        agent = self._agent
-        if not agent.rollout_replay:
-            return None
-        return RolloutReplay(agent.replay_buffer, *self._most_rollouts)
+        rollouts, _ = self._kept
+        return None if rollouts is None else RolloutReplay(self._agent.replay_buffer, *rollouts)
 
     def _value_expansion(self) -> ValueExpansion | None:
         agent = self._agent

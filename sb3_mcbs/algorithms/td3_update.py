@@ -16,40 +16,43 @@ import torch as th
 from stable_baselines3 import TD3
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
-from torch import nn
 
-from sb3_mcbs.algorithms.networks import actor_mlp, critic_mlps
+from sb3_mcbs.algorithms.mlp import MLP
+from sb3_mcbs.algorithms.plain_networks import actor_mlp, check_trained, critic_mlps, parameters_of
 
 logger = logging.getLogger("sb3_mcbs")
+
+_SB3S_TRAIN = TD3.train
 
 
 class TD3Update:
     """The gradient steps of a TD3 agent whose networks are plain MLPs.
 
+    It knows the networks, optimizers and parameters that there are when it is made.
+
     :param agent: the agent; its networks, optimizers, replay buffer and settings are used, and changed, as
         by its own ``train``.
-    :raises TypeError: if a network or optimizer is not covered. SB3's own ``train`` is for those.
+    :raises TypeError: if something about a network or optimizer is not covered. SB3's own ``train`` is for
+        those.
     """
+
+    _targets_and_networks: list[tuple[list[th.Tensor], list[th.Tensor]]]
 
     def __init__(self, agent: TD3) -> None:
         self._agent = agent
-        self._take_networks()
-
-    def _take_networks(self) -> None:
-        agent = self._agent
-        self._networks = self._present_networks()
-        self._actor, self._actor_target = actor_mlp(agent.actor), actor_mlp(agent.actor_target)
-        self._critics, self._critic_targets = critic_mlps(agent.critic), critic_mlps(agent.critic_target)
-        for network in (agent.actor, agent.critic):
-            _check_optimizer(network)
-        self._targets_and_networks: list[tuple[list[th.Tensor], list[th.Tensor]]] = [
-            (list(target.parameters()), list(network.parameters()))
-            for target, network in ((agent.critic_target, agent.critic), (agent.actor_target, agent.actor))
-        ]
-
-    def _present_networks(self) -> list[nn.Module]:
-        agent = self._agent
-        return [agent.actor, agent.actor_target, agent.critic, agent.critic_target]
+        self._actor, actor = _actor_and_parameters(agent.actor)
+        self._actor_target, actor_target = _actor_and_parameters(agent.actor_target)
+        self._critics, critic = _critics_and_parameters(agent.critic)
+        self._critic_targets, critic_target = _critics_and_parameters(agent.critic_target)
+        check_trained(agent.actor, actor)
+        check_trained(agent.critic, critic)
+        if len({*map(id, actor), *map(id, critic)}) != len(actor) + len(critic):
+            raise TypeError("a parameter is used twice")
+        self._targets_and_networks = [(critic_target, critic), (actor_target, actor)]
+        if len(actor_target) != len(actor) or len(critic_target) != len(critic):
+            raise TypeError("a target network is of another shape than its network")
+        if th.is_anomaly_enabled():
+            raise TypeError("autograd looks for anomalies")
 
     def train(self, gradient_steps: int, batch_size: int) -> None:
         """Do what ``TD3.train`` does.
@@ -58,8 +61,6 @@ class TD3Update:
         :param batch_size: transitions sampled for each.
         """
         agent = self._agent
-        if self._present_networks() != self._networks:
-            self._take_networks()
         # No layer here does anything else in training mode, so the mode stays as it is.
         agent._update_learning_rate([agent.actor.optimizer, agent.critic.optimizer])
         actor_losses, critic_losses = [], []
@@ -154,24 +155,34 @@ class FastUpdate(TD3):
 
     #: Whether to; ``False`` leaves gradient steps to SB3.
     fast_update: bool
-    _update: TD3Update | None = None
+    #: Why they were left to SB3 although it is True, as far as the user was told.
+    _reasons_said: frozenset[str] = frozenset()
 
     def _setup_model(self) -> None:
+        super()._setup_model()
+        self._reasons_said = frozenset()
+        self._present_update()  # whoever cannot have it is told at once
+
+    def _make_update(self) -> TD3Update:
+        if getattr(super().train, "__func__", None) is not _SB3S_TRAIN:
+            raise TypeError("a class of the agent's has a train of its own")
+        return TD3Update(self)
+
+    def _present_update(self) -> TD3Update | None:
+        """The fast gradient steps for the networks and optimizers as they are now, if there are any."""
         if not isinstance(self.fast_update, bool):
             raise TypeError(f"fast_update must be True or False, got {self.fast_update!r}.")
-        super()._setup_model()
-        self._update = self._make_update()
-
-    def _make_update(self) -> TD3Update | None:
         if not self.fast_update:
             return None
         try:
-            return TD3Update(self)
+            return self._make_update()
         except TypeError as reason:
             message = f"Gradient steps are SB3's own, not the fast ones: {reason}."
-            logger.info(message)
-            if self.verbose >= 1:
-                print(message)
+            if message not in self._reasons_said:
+                self._reasons_said |= {message}
+                logger.info(message)
+                if self.verbose >= 1:
+                    print(message)
             return None
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
@@ -181,28 +192,24 @@ class FastUpdate(TD3):
         :param gradient_steps: how many gradient steps to do
         :param batch_size: transitions sampled for each
         """
-        if self._update is None:
+        update = self._present_update()
+        if update is None:
             super().train(gradient_steps, batch_size)
         else:
-            self._update.train(gradient_steps, batch_size)
+            update.train(gradient_steps, batch_size)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_update"]
+        return [*super()._excluded_save_params(), "_reasons_said"]
 
 
-def _check_optimizer(network: nn.Module) -> None:
-    optimizer: Any = network.optimizer
-    if type(optimizer) is not th.optim.Adam or len(optimizer.param_groups) != 1:
-        raise TypeError(
-            f"the optimizer is {type(optimizer).__name__}, not Adam with a single group of parameters"
-        )
-    group = optimizer.param_groups[0]
-    if [id(p) for p in group["params"]] != [id(p) for p in network.parameters()]:
-        raise TypeError("an optimizer does not hold the parameters of its network")
-    if group["differentiable"] or group["capturable"]:
-        raise TypeError("Adam is differentiable or capturable")
-    if not all(p.requires_grad and p.dtype == th.float32 for p in group["params"]):
-        raise TypeError("parameters are frozen or not float32")
+def _actor_and_parameters(actor: Any) -> tuple[MLP, list[Any]]:
+    mlp = actor_mlp(actor)
+    return mlp, parameters_of(actor, [mlp])
+
+
+def _critics_and_parameters(critic: Any) -> tuple[list[MLP], list[Any]]:
+    mlps = critic_mlps(critic)
+    return mlps, parameters_of(critic, mlps)
 
 
 def _pairs(observations: th.Tensor, actions: th.Tensor) -> th.Tensor:

@@ -7,6 +7,7 @@ some steps later: rewards are exact, actions are not old ones as in the returns 
 travel several steps in one update.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from operator import itemgetter
 from typing import Any, cast
@@ -17,7 +18,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_mcbs.algorithms.mixed_batches import Outcome, Samples, as_samples
-from sb3_mcbs.algorithms.networks import policy_function, soft_policy_function
+from sb3_mcbs.algorithms.networks import policy_function, soft_policy_function, unscale_function
 from sb3_mcbs.algorithms.searcher import Searcher
 from sb3_mcbs.algorithms.torch_settings import one_thread
 from sb3_mcbs.models import ForwardModelError
@@ -102,11 +103,6 @@ class ValueExpansion:
 
     def __init__(self, agent: Any, searcher: Searcher) -> None:
         self._agent, self._searcher = agent, searcher
-        if isinstance(agent, SAC | TQC):
-            self._act = soft_policy_function(agent)
-        else:
-            policy = policy_function(agent, target=True)
-            self._act = lambda observations, rng: (policy(observations), np.zeros(len(observations)))
         self._before: np.ndarray | None = None
         buffer = self._buffer = cast(Any, agent.replay_buffer)
         shape = (buffer.buffer_size, buffer.n_envs)
@@ -115,6 +111,13 @@ class ValueExpansion:
             (state,) = self._states(range(1))
             buffer.expansion_states = np.zeros((*shape, len(state)))
             buffer.expansion_held = np.zeros(shape, dtype=bool)
+
+    def _acting(self) -> Callable[[Observations, np.random.Generator], tuple[np.ndarray, np.ndarray]]:
+        """The actor of the targets as it is now: its actions, and what their entropy adds."""
+        if isinstance(self._agent, SAC | TQC):
+            return soft_policy_function(self._agent)
+        policy = policy_function(self._agent, target=True)
+        return lambda observations, rng: (policy(observations), np.zeros(len(observations)))
 
     def _states(self, envs: range) -> np.ndarray:
         searcher = self._searcher
@@ -222,9 +225,10 @@ class ValueExpansion:
         assert model is not None
         model.set_roots(list(states), np.arange(len(going)), rng)
         seen = buffer._normalize_obs(take_rows(last, going), env)
+        act, unscale = self._acting(), unscale_function(self._agent)
         for number in range(1, self._agent.value_expansion + 1):
-            actions, bonus = self._act(seen, rng)
-            step = model.step(searcher.unscale(actions))
+            actions, bonus = act(seen, rng)
+            step = model.step(unscale(actions))
             self._agent.n_simulated_steps += len(going)
             valid = np.flatnonzero(step.valid)  # a simulation that diverged ends one step earlier
             at = going[valid]

@@ -24,6 +24,7 @@ from stable_baselines3.common.vec_env import (
 )
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvWrapper
 
+from sb3_mcbs.algorithms.faults import check_whole
 from sb3_mcbs.models import Environments, LocalEnvironments, WorkerEnvironments
 from sb3_mcbs.models.base import Observations
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
@@ -39,9 +40,11 @@ class AgentView:
 
     :param vec_env: the environment that the agent acts in.
     :param reward_normalizer: the ``VecNormalize`` whose reward scale the critics learned, if any.
+    :raises ValueError: see :func:`~sb3_mcbs.algorithms.faults.check_whole`.
     """
 
     def __init__(self, vec_env: VecEnv, reward_normalizer: VecNormalize | None) -> None:
+        check_whole(vec_env)
         self.vec_env = vec_env
         self.reward_normalizer = reward_normalizer
 

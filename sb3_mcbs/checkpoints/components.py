@@ -32,7 +32,7 @@ NOT_STATE: dict[type, dict[str, str]] = {
         "_decision": "of the last step; made anew before it is read",
         "_rollouts": "of the last step; made anew before it is read",
         "_simulated_batches": "a view of the replay buffer",
-        "_update": "a view of networks, optimizers and replay buffer",
+        "_reasons_said": "what the user of this process was told",
         "_checked_env": "a view of the environment",
         "_resumption": "only there until a run was resumed",
         "_setup_learn": "only replaced until a run was resumed",

@@ -6,6 +6,7 @@ reader hands in, because its own agent and environments use them.
 """
 
 import enum
+import functools
 import hashlib
 import json
 import math
@@ -23,8 +24,9 @@ from sb3_mcbs.snapshot.classes import ClassName
 from sb3_mcbs.snapshot.functions import FunctionName
 from sb3_mcbs.snapshot.graph import Ref, class_name
 
-#: Compiled containers that are made by calling their class; nothing else is ever called.
-CALLED = (OrderedDict, defaultdict)
+#: Compiled containers that are made by calling their class; nothing else is ever called. Making a partial
+#: calls nothing, and what it will call is among the functions that may be named.
+CALLED = (OrderedDict, defaultdict, functools.partial)
 _PLAIN_DTYPES = "biufc"
 
 

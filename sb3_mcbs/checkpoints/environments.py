@@ -14,8 +14,8 @@ from sb3_mcbs.checkpoints.errors import CheckpointError
 from sb3_mcbs.checkpoints.files import read_written, results_file, write_again
 from sb3_mcbs.checkpoints.names import known_names
 from sb3_mcbs.snapshot import Snapshot, SnapshotEnvWrapper, SnapshotError
+from sb3_mcbs.snapshot.pairing import FrozenLayer
 from sb3_mcbs.snapshot.replay import Episode
-from sb3_mcbs.snapshot.state import FrozenLayer
 
 _Generators = dict[str, Any]
 

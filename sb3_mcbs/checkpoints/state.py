@@ -10,6 +10,8 @@ from stable_baselines3.common.logger import KVWriter
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecMonitor
 
+from sb3_mcbs.algorithms import SearchPolicy
+from sb3_mcbs.algorithms.attributes import SearchAttributes
 from sb3_mcbs.algorithms.vec_env_view import snapshot_environments
 from sb3_mcbs.checkpoints.components import components, layers_of, not_state_of
 from sb3_mcbs.checkpoints.encoding import Decoder, Encoded, Encoder, in_section, of_section
@@ -179,6 +181,9 @@ class RunState:
     def _set_rest(self, rest: dict[str, Any]) -> None:
         agent = self._agent
         agent.start_time = time.time_ns() - int(rest["seconds"] * 1e9)
+        for part in self._components.values():
+            if isinstance(part, SearchAttributes | SearchPolicy):  # a callback may have changed its settings
+                part._follow_settings()
         for name, searcher in self._searchers().items():
             searcher.memory = rest["searchers"][name]
         open_log_files(agent.logger)

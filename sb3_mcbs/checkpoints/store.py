@@ -86,9 +86,8 @@ def write_file(path: Path, write: Callable[[Any], Any]) -> FileSeal:
     :param write: called with an open file that cannot be sought in.
     """
     with open(path, "wb") as file:
-        sealing = _Sealing(file)
-        write(sealing)
-        file.flush()
+        with _Sealing(file) as sealing:  # closed while the file is open, which closing flushes
+            write(sealing)
         os.fsync(file.fileno())
     return sealing.seal
 

@@ -49,11 +49,13 @@ class ForwardModel(ABC):
         search then simulates the first step of a candidate once for all its simulations.
     :ivar kind: the backend, ``"mujoco"``, ``"pool"`` or ``"ensemble"``; what ``forward_model=`` asks for.
     :ivar description: one line for a log: which backend, and why if it was chosen by itself.
+    :ivar first_error: traceback of the first error that an environment raised in a simulation; "" for none.
     """
 
     deterministic: bool
     kind: str
     description: str
+    first_error: str = ""
 
     @property
     @abstractmethod

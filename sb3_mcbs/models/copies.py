@@ -3,6 +3,7 @@
 The functions at the end run where the environment lives, and find its copies by the pool's name.
 """
 
+import traceback
 from contextlib import nullcontext
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -192,18 +193,19 @@ class Copies:
 
         :param actions: ``[rows, *act_shape]``.
         :return: observations (one per row), rewards, terminated, valid and stopped ``[rows]``, and the
-            first error that an environment raised.
+            traceback of the first error that an environment raised.
         """
         isolation = isolated_globals(int(self._rng.integers(2**32))) if self.isolate else nullcontext()
         with isolation:
             errors = [row.step(action) for row, action in zip(self.rows, actions, strict=True)]
-        messages = [f"{type(error).__name__}: {error}" for error in errors if error is not None]
+        first = next((error for error in errors if error is not None), None)
+        trace = "" if first is None else "".join(traceback.format_exception(first))
         observations = [row.observation for row in self.rows]
         rewards = np.array([row.reward for row in self.rows])
         terminated = np.array([row.terminated for row in self.rows], dtype=bool)
         valid = np.array([row.valid for row in self.rows], dtype=bool)
         stopped = np.array([row.stopped for row in self.rows], dtype=bool)
-        return observations, rewards, terminated, valid, stopped, messages[0] if messages else ""
+        return observations, rewards, terminated, valid, stopped, trace
 
     def _close_rows(self) -> None:
         for row in (*self.rows, *self._spare):

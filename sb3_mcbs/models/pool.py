@@ -59,7 +59,6 @@ class EnvPoolModel(ForwardModel):
         self._name = uuid.uuid4().hex
         #: Which environments have rows, and how many.
         self._counts: dict[int, int] = {}
-        self._warned = False
         #: Numbers of states that are kept next to the environments and that nobody needs, by environment.
         self._dropped: list[list[int]] = [[] for _ in range(len(environments))]
         environments.when_gone(self, drop_copies, self._name)
@@ -111,11 +110,11 @@ class EnvPoolModel(ForwardModel):
         args = {i: (part,) for i, part in zip(self._counts, parts, strict=True) if len(part)}
         results = self._each(step_rows, args)
         errors = [result[5] for result in results if result[5]]
-        if errors and not self._warned:
-            self._warned = True
+        if errors and not self.first_error:
+            self.first_error = errors[0]
             logger.warning(
                 "a copy of the environment raised in a look-ahead, which makes that row invalid: %s",
-                errors[0],
+                self.first_error.strip().splitlines()[-1],
             )
         observations = stack([observation for result in results for observation in result[0]])
         rewards, terminated, valid, stopped = (

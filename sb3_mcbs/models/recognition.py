@@ -17,6 +17,7 @@ from sb3_mcbs.models.families import Constants, Fields, family_of, known_familie
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 from sb3_mcbs.snapshot.layers import replaced_method
 from sb3_mcbs.snapshot.spaces import random_action
+from sb3_mcbs.snapshot.stand_ins import StandIn
 
 #: Wrappers that change neither observation nor reward nor action, by their full names: RL Zoo
 #: exchanges Gymnasium's TimeLimit for its own when it is imported, before or after ours.
@@ -98,8 +99,9 @@ def recognize(wrapper: SnapshotEnvWrapper) -> KnownEnvironment | Refusal:
             return Refusal(f"{type(layer).__name__}.{replaced} was replaced on the instance", notable)
         if not isinstance(layer, gym.Wrapper):
             break
-        if type(layer) is not SnapshotEnvWrapper and full_name(type(layer)) not in _TRANSPARENT:
-            reason = f"the wrapper {type(layer).__name__} may change observations, rewards or actions"
+        kind = type(layer).stands_for if isinstance(layer, StandIn) else type(layer)
+        if kind is not SnapshotEnvWrapper and full_name(kind) not in _TRANSPARENT:
+            reason = f"the wrapper {kind.__name__} may change observations, rewards or actions"
             return Refusal(reason, notable)
         layer = layer.env
     family = family_of(type(layer))

@@ -26,7 +26,12 @@ class ArrayKind:
         content = obj.copy(order="K")
         content.setflags(write=False)
         if obj.base is not None and _is_borrowed(obj):
+            if type(_owner(obj)).__module__.startswith("pygame."):
+                raise SnapshotUnsupportedError("it shows the memory of a pygame surface")
             return "borrowed", content, freezer.places.find(obj)
+        owner = None if obj.base is None else _owner(obj)
+        if _is_of_cython(owner) and freezer.owner_of(owner, obj) is not None:
+            raise SnapshotUnsupportedError("it shares its memory with another array, and both are Cython's")
         return "own", content, obj.flags.writeable
 
     def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
@@ -117,7 +122,13 @@ def _owner(view: np.ndarray) -> Any:
     base = base.obj if isinstance(base, memoryview) else base
     while getattr(base, "_b_base_", None) is not None:  # a part of a ctypes object
         base = base._b_base_
-    return base
+    return base.base if type(base).__name__ == "_memoryviewslice" else base
+
+
+def _is_of_cython(owner: Any) -> bool:
+    """Return whether an object is memory that Cython made for an array, as of SciPy's rotations."""
+    cls = type(owner)
+    return cls.__name__ == "array" and cls.__module__ in ("_cyutility", "View.MemoryView")
 
 
 def _is_plain_memory(owner: Any) -> bool:
@@ -132,7 +143,7 @@ def _is_plain_memory(owner: Any) -> bool:
 def _is_borrowed(view: np.ndarray) -> bool:
     """Return whether the memory belongs to a simulator, a file or another process."""
     owner = _owner(view)
-    return owner is not None and not isinstance(owner, bytes) and not _is_plain_memory(owner)
+    return not (owner is None or isinstance(owner, bytes) or _is_plain_memory(owner) or _is_of_cython(owner))
 
 
 def _order(values: np.ndarray) -> Literal["C", "F"]:

@@ -4,6 +4,7 @@ from typing import Any
 
 import gymnasium as gym
 
+from sb3_mcbs.snapshot.drawing import stays
 from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
 from sb3_mcbs.snapshot.graph import ATOMIC_CLASSES, MISSING, Freezer, Ref, Thawer
 from sb3_mcbs.snapshot.kinds import kind_of
@@ -64,7 +65,11 @@ def thaw_attributes(
     have = attributes_of(env)
     values = dict(attributes)
     for name, value in attributes.items():
-        if type(value) is Ref and name != "_np_random":
+        if value is None:
+            there = have.get(name)
+            if there is not None and stays(there, kind_of):  # such as a window that was opened since
+                del values[name]
+        elif type(value) is Ref and name != "_np_random":
             try:
                 values[name] = thawer.thaw(value, have.get(name, MISSING))
             except SnapshotUnsupportedError as error:
@@ -85,5 +90,4 @@ def thaw_attributes(
 
 
 def _stays(name: str, value: Any) -> bool:
-    kind = kind_of(value)
-    return name == "_np_random" or (kind is not None and kind.name in ("constant", "window"))
+    return name == "_np_random" or stays(value, kind_of)

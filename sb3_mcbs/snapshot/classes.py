@@ -220,7 +220,7 @@ class ClassKind:
 
     def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
         name, bases, members = payload
-        if name.is_name_of(current):
+        if name.is_name_of(current) and id(current) not in thawer.foreign:
             thawer.memo[index] = current
             for base, its in zip(bases, current.__bases__, strict=True):
                 thawer.thaw(base, its)

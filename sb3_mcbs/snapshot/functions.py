@@ -8,6 +8,7 @@ from typing import Any
 
 from sb3_mcbs.snapshot.errors import SnapshotMismatchError, SnapshotUnsupportedError
 from sb3_mcbs.snapshot.graph import ATOMIC_CLASSES, MISSING, Copier, Freezer, Thawer
+from sb3_mcbs.snapshot.stand_ins import bound, function_of
 
 _EMPTY = ("empty",)
 # Names what a function was made from, which is not state.
@@ -90,7 +91,7 @@ class FunctionKind:
     name = "function"
 
     def freeze(self, freezer: Freezer, obj: types.FunctionType) -> Any:
-        if not _is_own(obj):
+        if not is_own(obj):
             return FunctionName(obj), freezer.freeze_or_none(*(obj.__closure__ or ())) or (), None
         cells = []
         for name, cell in zip(obj.__code__.co_freevars, obj.__closure__ or (), strict=True):
@@ -103,7 +104,7 @@ class FunctionKind:
 
     def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
         name, cells, extras = payload
-        if name.is_name_of(current):
+        if name.is_name_of(current) and id(current) not in thawer.foreign:
             thawer.memo[index] = current
             if cells:
                 for value, cell in zip(cells, current.__closure__ or (), strict=True):
@@ -123,7 +124,7 @@ class FunctionKind:
         return made
 
     def copy(self, copier: Copier, obj: types.FunctionType) -> Any:
-        if _is_own(obj):
+        if is_own(obj):
             return _copy(copier, obj, _extras(obj))
         try:
             return _copy(copier, obj, _NO_EXTRAS)
@@ -136,8 +137,11 @@ Extras = tuple[Any, Any, Any]
 _NO_EXTRAS: Extras = (None, None, ())
 
 
-def _is_own(function: types.FunctionType) -> bool:
-    """Return whether a function belongs to one environment: no module names it."""
+def is_own(function: types.FunctionType) -> bool:
+    """Return whether a function belongs to one environment: no module names it.
+
+    :param function: the function.
+    """
     if "<" in function.__qualname__:
         return True
     found: Any = sys.modules.get(function.__module__)
@@ -273,18 +277,16 @@ class MethodKind:
     name = "method"
 
     def freeze(self, freezer: Freezer, obj: types.MethodType) -> Any:
-        return freezer.freeze(obj.__func__), freezer.freeze(obj.__self__)
+        return freezer.freeze(function_of(obj)), freezer.freeze(obj.__self__)
 
     def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
         is_method = isinstance(current, types.MethodType)
         function = thawer.thaw(payload[0], current.__func__ if is_method else MISSING)
-        owner = thawer.thaw(payload[1], current.__self__ if is_method else MISSING)
-        if is_method and current.__func__ is function and current.__self__ is owner:
-            return current
-        return types.MethodType(function, owner)
+        made = bound(function, thawer.thaw(payload[1], current.__self__ if is_method else MISSING))
+        return current if made == current else made
 
     def copy(self, copier: Copier, obj: types.MethodType) -> Any:
-        return types.MethodType(copier.copy(obj.__func__), copier.copy(obj.__self__))
+        return bound(copier.copy(function_of(obj)), copier.copy(obj.__self__))
 
 
 class BuiltinMethodKind:

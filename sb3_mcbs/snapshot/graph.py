@@ -93,6 +93,8 @@ class Freezer:
         self.adapted: list[Any] = []
         #: The tensors that were captured.
         self.tensors: list[Any] = []
+        #: Whether weak references were.
+        self.weak = False
         self._kind_of = kind_of
         self._memo = dict(known)
         self._owners: dict[int, Ref] = {}
@@ -113,7 +115,14 @@ class Freezer:
         ref = self._memo[id(value)] = Ref(len(self.nodes))
         self.nodes.append(("pending", None))
         self.objects.append(value)
-        self.nodes[ref.index] = (kind.name, kind.freeze(self, value))
+        try:
+            self.nodes[ref.index] = (kind.name, kind.freeze(self, value))
+        except (SnapshotError, RecursionError):
+            raise
+        except Exception as error:
+            raise SnapshotUnsupportedError(
+                f"capturing a {class_name(type(value))} raised {type(error).__name__}: {error}"
+            ) from error
         return ref
 
     def owner_of(self, part: Any, obj: Any) -> Ref | None:
@@ -156,6 +165,7 @@ class Thawer:
     :param rng: what happens to random generators: "restore", "keep", or a generator to seed them from.
     :param originals: the objects that the nodes were made of, if those are to be put back themselves.
     :param places: finds views into simulators.
+    :param foreign: ids of functions and classes that are there and belong to another environment.
     """
 
     def __init__(
@@ -166,8 +176,10 @@ class Thawer:
         rng: RngMode,
         originals: list[Any] | None = None,
         places: Places | None = None,
+        foreign: frozenset[int] = frozenset(),
     ) -> None:
         self.rng = rng
+        self.foreign = foreign
         self.places = places or Places()
         #: The objects that adapters put back, by the number of their node.
         self.adapted: dict[int, Any] = {}

@@ -17,6 +17,7 @@ from sb3_mcbs.snapshot import generators
 from sb3_mcbs.snapshot.arrays import ArrayKind, BytearrayKind, counterpart
 from sb3_mcbs.snapshot.classes import ClassKind, LocalClassKind, is_local, is_made_per_instance
 from sb3_mcbs.snapshot.containers import DictKind, SequenceKind
+from sb3_mcbs.snapshot.drawing import DrawnKind, kind_name
 from sb3_mcbs.snapshot.errors import SnapshotMismatchError
 from sb3_mcbs.snapshot.functions import BuiltinMethodKind, CellKind, FunctionKind, MethodKind
 from sb3_mcbs.snapshot.graph import ATOMIC_CLASSES, MISSING, Copier, Freezer, Kind, Thawer, class_name
@@ -29,25 +30,14 @@ from sb3_mcbs.snapshot.objects import (
     is_ordinary,
     thaw_content,
 )
+from sb3_mcbs.snapshot.pygame_values import PygameKind, SurfaceKind
 from sb3_mcbs.snapshot.randomness import GeneratorKind, SeedsKind, SpaceKind
 from sb3_mcbs.snapshot.registry import SnapshotAdapter, call_on_change, find_adapter
 from sb3_mcbs.snapshot.tensors import TensorKind, is_tensor
+from sb3_mcbs.snapshot.weak import PROXIES, ProxyKind, WeakrefKind
 
-#: Parts of packages that draw: what they hold is not state of the environment.
-_DRAWING = (
-    "pygame",
-    "glfw",
-    "OpenGL",
-    "pyglet",
-    "mujoco.renderer",
-    "mujoco.viewer",
-    "gymnasium.envs.mujoco.mujoco_rendering",
-    "gymnasium.envs.classic_control.rendering",
-)
-#: Parts of such packages that games keep their state in.
-_DRAWING_NOTHING = ("pygame.rect.", "pygame.math.", "pygame.sprite.")
 #: Classes whose objects hold caches besides what they say themselves that they are made of.
-_SAY_THEMSELVES = ("pandas.",)
+_SAY_THEMSELVES = ("pandas.", "PIL.")
 
 _SIMULATOR_PARTS = (
     "mujoco._structs.",
@@ -72,8 +62,8 @@ _EXACT: dict[type, str] = {
     types.BuiltinMethodType: "builtin",
     np.random.SeedSequence: "seeds",
     bytearray: "bytearray",
+    weakref.ref: "weakref",
 }
-_PROXIES = (weakref.ProxyType, weakref.CallableProxyType)
 _CONSTANT_BASES = (types.ModuleType, EnvSpec, WrapperSpec, logging.Logger, logging.LoggerAdapter)
 
 
@@ -114,35 +104,6 @@ class PartKind(ConstantKind):
 
     def copy(self, copier: Copier, obj: Any) -> Any:
         return counterpart(copier, obj)
-
-
-class ProxyKind:
-    """Weak proxies: what they stand for is held by something else, and captured with that."""
-
-    name = "proxy"
-
-    def freeze(self, freezer: Freezer, obj: Any) -> Any:
-        referent = _referent(obj)
-        return None if referent is MISSING else freezer.freeze(referent)
-
-    def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
-        if payload is None:  # it stood for nothing any more
-            return current
-        have = _referent(current) if type(current) in _PROXIES else MISSING
-        referent = thawer.thaw(payload, have)
-        return current if referent is have or referent is MISSING else weakref.proxy(referent)
-
-    def copy(self, copier: Copier, obj: Any) -> Any:
-        referent = _referent(obj)
-        return obj if referent is MISSING else weakref.proxy(copier.copy(referent))
-
-
-def _referent(proxy: Any) -> Any:
-    """Return what a proxy stands for; ``MISSING`` if that is gone."""
-    try:
-        return proxy.__reduce_ex__.__self__  # a proxy passes on what it is asked for
-    except ReferenceError:
-        return MISSING
 
 
 class AdapterKind:
@@ -206,9 +167,10 @@ def plan_adapter(thawer: Thawer, adapter: SnapshotAdapter | None, obj: Any, stat
 #: Kinds by name, as nodes name them.
 KINDS: dict[str, Kind] = {}
 for _kind_class in (
-    ConstantKind, WindowKind, PartKind, ArrayKind, BytearrayKind, TensorKind, SequenceKind, DictKind,
-    GeneratorKind, SeedsKind, SpaceKind, ObjectKind, ReducedKind, ProxyKind, AdapterKind,
-    ClassKind, LocalClassKind, FunctionKind, CellKind, MethodKind, BuiltinMethodKind,
+    ConstantKind, WindowKind, DrawnKind, PygameKind, SurfaceKind, PartKind, ArrayKind, BytearrayKind,
+    TensorKind, SequenceKind, DictKind, GeneratorKind, SeedsKind, SpaceKind, ObjectKind, ReducedKind,
+    ProxyKind, WeakrefKind, AdapterKind, ClassKind, LocalClassKind, FunctionKind, CellKind, MethodKind,
+    BuiltinMethodKind,
 ):  # fmt: skip
     KINDS[_kind_class.name] = _kind_class()
 
@@ -259,7 +221,7 @@ def _decide_class(cls: type) -> Kind | None:
 
 
 def _decide(obj: Any, cls: type) -> Kind | None:
-    if cls in _PROXIES:  # isinstance() takes them for what they stand for
+    if cls in PROXIES:  # isinstance() takes them for what they stand for
         return KINDS["proxy"]
     if issubclass(cls, _ATOMIC_BASES) and not issubclass(cls, np.void):
         return None
@@ -274,8 +236,9 @@ def _decide(obj: Any, cls: type) -> Kind | None:
     name = class_name(cls._type_ if issubclass(cls, ctypes._Pointer) else cls)
     if name.startswith(_SIMULATOR_PARTS):
         return KINDS["constant" if name.startswith(_MUJOCO_DRAWING) else "part"]
-    if any(name.startswith(part + ".") for part in _DRAWING) and not name.startswith(_DRAWING_NOTHING):
-        return KINDS["window"]
+    drawing = kind_name(cls, name)
+    if drawing is not None:
+        return KINDS[drawing]
     if is_tensor(obj):
         return KINDS["torch"]
     if generators.is_generator(obj):

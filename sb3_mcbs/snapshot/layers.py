@@ -7,6 +7,7 @@ import gymnasium as gym
 from gymnasium import spaces
 
 from sb3_mcbs.snapshot.graph import class_name
+from sb3_mcbs.snapshot.stand_ins import MONITOR, StandIn, left_out_class, set_by
 
 #: Attributes of a layer that say how it was made or how it is drawn.
 NOT_STATE = frozenset(
@@ -25,18 +26,12 @@ NOT_STATE = frozenset(
 # A wrapper's ``env`` is the layer below. An environment may hold its simulator under this name.
 _WRAPPER_NOT_STATE = NOT_STATE | {"env"}
 
-_MONITOR = "stable_baselines3.common.monitor.Monitor"
-# Monitor's file and the time since it was made belong to one instance.
-_MONITOR_NOT_STATE = _WRAPPER_NOT_STATE | {"results_writer", "t_start"}
+#: Monitor's file and the time since it was made belong to one instance.
+OF_ONE_MONITOR = frozenset({"results_writer", "t_start"})
 
-_RECORDERS = frozenset(
-    {
-        "gymnasium.wrappers.rendering.RecordVideo",
-        "gymnasium.wrappers.rendering.RenderCollection",
-        "gymnasium.wrappers.rendering.HumanRendering",
-        "sb3_mcbs.snapshot.wrapper.SnapshotEnvWrapper",
-    }
-)
+# Gymnasium's environments draw everything anew whenever they draw.
+_DRAWN = frozenset({"screen", "surf", "window", "window_surface"})
+_GYMNASIUM = tuple(f"gymnasium.envs.{part}." for part in ("classic_control", "box2d", "toy_text"))
 
 # RL Zoo puts its class in place of Gymnasium's when it is imported; their state is the same.
 _SAME_CLASS = {"rl_zoo3.gym_patches.PatchedTimeLimit": "gymnasium.wrappers.common.TimeLimit"}
@@ -46,17 +41,24 @@ class Layer(NamedTuple):
     """One layer.
 
     :param env: the wrapper or the environment.
-    :param name: its class; equal for classes whose states can be exchanged.
-    :param recorder: whether it only draws or records: it has no state of ours and a copy is made without it.
-    :param monitor: whether it is SB3's ``Monitor``: it has state, and a copy is made without it.
-    :param not_state: names of attributes that are not captured.
+    :param cls: its class, or that of the wrapper in whose place it is.
+    :param name: of its class; equal for classes whose states can be exchanged.
+    :param left_out: whether it only monitors, draws or records: in a copy a stand-in takes its place, and a
+        snapshot holds what others have set on it.
+    :param monitor: whether it is SB3's ``Monitor``; what that itself remembers is captured on request.
+    :param own: names of the attributes that such a layer itself sets, besides its stand-in's.
+    :param not_state: names of attributes that are not captured, these and the next included.
+    :param drawn: names of attributes for what an environment of Gymnasium draws on; there is none in a copy.
     """
 
     env: Any
+    cls: type
     name: str
-    recorder: bool
+    left_out: bool
     monitor: bool
+    own: frozenset[str]
     not_state: frozenset[str]
+    drawn: frozenset[str] = frozenset()
 
 
 def layers_of(env: Any) -> list[Layer]:
@@ -65,15 +67,25 @@ def layers_of(env: Any) -> list[Layer]:
     :param env: the environment with its wrappers.
     """
     layers: list[Layer] = []
-    while True:
-        names = [class_name(cls) for cls in type(env).__mro__]
-        recorder, monitor = not _RECORDERS.isdisjoint(names), _MONITOR in names
-        name = _SAME_CLASS.get(names[0], names[0])
-        if not isinstance(env, gym.Wrapper):
-            return [*layers, Layer(env, name, recorder, monitor, NOT_STATE)]
-        not_state = _MONITOR_NOT_STATE if monitor else _WRAPPER_NOT_STATE
-        layers.append(Layer(env, name, recorder, monitor, not_state))
+    while isinstance(env, gym.Wrapper):
+        layers.append(_layer(env))
         env = env.env
+    cls = type(env)
+    own = any(base.__module__.startswith(_GYMNASIUM) for base in cls.__mro__)
+    drawn = _DRAWN if own else frozenset()
+    return [*layers, Layer(env, cls, class_name(cls), False, False, frozenset(), NOT_STATE | drawn, drawn)]
+
+
+def _layer(env: Any) -> Layer:
+    cls = type(env).stands_for if isinstance(env, StandIn) else type(env)
+    name = class_name(cls)
+    name = _SAME_CLASS.get(name, name)
+    known = left_out_class(cls)
+    if known is None:
+        return Layer(env, cls, name, False, False, frozenset(), _WRAPPER_NOT_STATE)
+    monitors = class_name(known) == MONITOR and not isinstance(env, StandIn)
+    own = set_by(known)
+    return Layer(env, cls, name, True, monitors, own, _WRAPPER_NOT_STATE | own)
 
 
 def describe_space(space: Any) -> str:

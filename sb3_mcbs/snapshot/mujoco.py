@@ -47,7 +47,9 @@ class _ModelLayout:
     def __init__(self, model: Any) -> None:
         values = {name: getattr(model, name) for name in public(type(model))}
         arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
-        self.sizes = {name: value for name, value in values.items() if type(value) is int}
+        # Pickled models have lost their signature.
+        is_size = {name: type(value) is int and name != "signature" for name, value in values.items()}
+        self.sizes = {name: value for name, value in values.items() if is_size[name]}
         self.names = bytes(model.names)
         self.blocks = _blocks(
             [array for name, array in arrays.items() if name not in _LEFT_OUT], arrays, model.nbuffer

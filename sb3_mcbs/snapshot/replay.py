@@ -50,6 +50,10 @@ class Recorder:
         self._not_state = NOT_STATE | not_state
         self.episode: Episode | None = None
         self.actions: list[Any] = []
+        #: Whether steps were taken that no record of an episode began with.
+        self.unrecorded = False
+        #: Whether it is in a state that no record leads to: it has to be reset before it is stepped.
+        self.must_reset = False
         self._reset = env.reset
         self._step = env.step
         # Many environments step once in their reset, and that step must not be recorded as well.
@@ -77,6 +81,9 @@ class Recorder:
         :return: what the environment returns.
         """
         if not self._inside:
+            if self.must_reset:
+                raise SnapshotUnsupportedError(_unrecorded(self.env))
+            self.unrecorded = self.episode is None
             self.actions.append(private_copy(action))
         return self._call(self._step, action)
 
@@ -101,6 +108,7 @@ class Recorder:
         attributes = freeze_attributes(freezer, self.env, self._not_state, skip_unsupported=True)
         self.episode = Episode(attributes, tuple(freezer.nodes), private_copy(arguments), ())
         self.actions = []
+        self.unrecorded = self.must_reset = False
 
     def replay(self, episode: Episode) -> None:
         """Repeat an episode on the environment.
@@ -119,6 +127,7 @@ class Recorder:
             self.env.render_mode = render_mode
         self.episode = episode._replace(actions=())
         self.actions = list(episode.actions)
+        self.unrecorded = self.must_reset = False
 
 
 class ReplayAdapter(SnapshotAdapter):
@@ -156,6 +165,8 @@ class ReplayAdapter(SnapshotAdapter):
                 f"a {type(obj).__name__} is restored by replay, which is possible only where it is the "
                 "environment itself"
             )
+        if recorder.unrecorded:
+            raise SnapshotUnsupportedError(_unrecorded(obj))
         if recorder.episode is None:
             return None
         return recorder.episode._replace(actions=tuple(recorder.actions))
@@ -165,6 +176,7 @@ class ReplayAdapter(SnapshotAdapter):
         assert recorder is not None, "attach() comes before restore()"
         if state is None:
             recorder.episode, recorder.actions = None, []
+            recorder.must_reset, recorder.unrecorded = True, False
             return
         start = time.perf_counter()
         recorder.replay(state)
@@ -187,6 +199,13 @@ class ReplayAdapter(SnapshotAdapter):
             "in an episode it takes longer.",
             stacklevel=2,
         )
+
+
+def _unrecorded(env: Any) -> str:
+    return (
+        f"a {type(env).__name__} is restored by replay, and the reset of this episode was not recorded: it "
+        "was before the environment was wrapped. Reset it"
+    )
 
 
 def _recorder(env: Any) -> Recorder | None:

@@ -3,41 +3,28 @@
 import contextlib
 import itertools
 import operator
+import types
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import gymnasium as gym
 
 from sb3_mcbs.snapshot.attributes import freeze_attributes, thaw_attributes
-from sb3_mcbs.snapshot.errors import SnapshotMismatchError, SnapshotUnsupportedError
+from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
+from sb3_mcbs.snapshot.functions import is_own
 from sb3_mcbs.snapshot.global_generators import globals_kept
 from sb3_mcbs.snapshot.graph import Copier, Freezer, Node, Ref, RngMode, Thawer
 from sb3_mcbs.snapshot.kinds import KINDS, kind_of, plan_adapter
-from sb3_mcbs.snapshot.layers import Layer, layers_of
+from sb3_mcbs.snapshot.layers import OF_ONE_MONITOR, Layer, layers_of
 from sb3_mcbs.snapshot.objects import attributes_of, blank, set_attributes
+from sb3_mcbs.snapshot.pairing import FrozenLayer, check, pair
 from sb3_mcbs.snapshot.places import Places
 from sb3_mcbs.snapshot.registry import SnapshotAdapter, find_adapter
+from sb3_mcbs.snapshot.stand_ins import stand_in
 from sb3_mcbs.snapshot.tensors import check_memory
+from sb3_mcbs.snapshot.weak import check_held
 
 _NEEDS_RENDERING = "gymnasium.wrappers.transform_observation.AddRenderObservation"
-
-
-class FrozenLayer(NamedTuple):
-    """The captured state of one layer.
-
-    :param name: its class.
-    :param monitor: whether it is SB3's ``Monitor``, which may be missing where the state is put back.
-    :param adapted: what the layer's adapter captured, in a tuple; None if it has no adapter.
-    :param attributes: the frozen value of each captured attribute; None if none are captured, as of a
-        ``Monitor`` that was left out.
-    :param cls: the layer's frozen class, which has state of its own if it was made for this layer.
-    """
-
-    name: str
-    monitor: bool
-    adapted: tuple[Any] | None
-    attributes: dict[str, Any] | None
-    cls: Any
 
 
 class Kept(NamedTuple):
@@ -62,8 +49,6 @@ class Stack:
 
     def __init__(self, owner: gym.Wrapper[Any, Any, Any, Any]) -> None:
         self.layers = [_with_adapter(layer) for layer in layers_of(owner.env)]
-        self._stateful = [layer for layer in self.layers if not layer.recorder]
-        self._names = [layer.name for layer in self._stateful]
         self._adapters: dict[int, SnapshotAdapter] = {}
         self._owner = owner
         self.monitors = [layer.env for layer in self.layers if layer.monitor]
@@ -76,16 +61,12 @@ class Stack:
                     f"{layer.name} draws its observations, and copies of an environment cannot draw. "
                     "Remove the wrapper."
                 )
-            adapter = find_adapter(layer.env)
+            adapter = None if layer.left_out else find_adapter(layer.env)
             if adapter is not None:
                 adapter.attach(layer.env)
                 self._adapters[id(layer.env)] = adapter
-        # A recorder is named as the layer below it: where the state is put back there may be none.
-        self._refs = {id(owner): Ref(0)}
-        place = 0
-        for layer in self.layers:
-            self._refs[id(layer.env)] = Ref(place)
-            place += not layer.recorder
+        self._refs = {id(layer.env): Ref(place) for place, layer in enumerate(self.layers)}
+        self._refs[id(owner)] = Ref(0)
 
     @property
     def is_whole(self) -> bool:
@@ -98,25 +79,28 @@ class Stack:
         return True
 
     @contextlib.contextmanager
-    def bare(self) -> Iterator[gym.Env[Any, Any]]:
-        """Take out monitors and recorders, and draw nothing, while it is entered.
-
-        :return: the outermost of the other layers.
-        """
-        kept = [layer.env for layer in self.layers if not layer.recorder and not layer.monitor]
-        below = [env.env for env in kept[:-1]]
-        draws = vars(kept[-1]).get("render_mode")
+    def bare(self) -> Iterator[None]:
+        """Monitor, record and draw nothing while it is entered. After that, all is as it was."""
+        kept = self.keep(monitor=False)
+        left_out = [layer for layer in self.layers if layer.left_out]
+        classes = [type(layer.env) for layer in left_out]
+        base = self.layers[-1].env
+        draws = vars(base).get("render_mode")
         try:
-            for env, its in itertools.pairwise(kept):
-                env.env = its
+            for layer in left_out:
+                layer.env.__class__ = stand_in(layer.cls)
             if draws is not None:
-                kept[-1].render_mode = None
-            yield kept[0]
+                base.render_mode = None
+            if any(_is_method_of(left_out, obj) for obj in kept.objects):
+                # Whoever holds such a method gets that of the stand-in.
+                self.thaw(kept.layers, kept.nodes, "restore")
+            yield
         finally:
-            for env, its in zip(kept, below, strict=False):
-                env.env = its
+            for layer, cls in zip(left_out, classes, strict=True):
+                layer.env.__class__ = cls
             if draws is not None:
-                kept[-1].render_mode = draws
+                base.render_mode = draws
+            self.put_back(kept)
 
     @property
     def incomplete_clones(self) -> bool:
@@ -146,12 +130,13 @@ class Stack:
         :raises SnapshotUnsupportedError: if a layer holds something that cannot be captured.
         """
         while True:
-            freezer = Freezer(kind_of, self._refs, len(self._stateful), Places(self._watched or ()))
-            frozen = tuple([self._freeze_layer(freezer, layer, monitor) for layer in self._stateful])
+            freezer = Freezer(kind_of, self._refs, len(self.layers), Places(self._watched or ()))
+            frozen = tuple([self._freeze_layer(freezer, layer, monitor) for layer in self.layers])
             self._watch(freezer.adapted)
             if freezer.places.are_of(freezer.adapted):
                 break
         check_memory(freezer)
+        check_held(freezer, frozen)
         return Kept(frozen, tuple(freezer.nodes), freezer.objects)
 
     def put_back(self, kept: Kept) -> None:
@@ -163,6 +148,17 @@ class Stack:
         """
         self._thaw(kept.layers, kept.nodes, "restore", kept.objects)
         self.find_simulators()
+
+    def become(self, kept: Kept, shares: bool) -> None:
+        """Put the layers of a copy that was made otherwise into the state of the original.
+
+        :param kept: of the original's :meth:`keep`.
+        :param shares: whether the copy may have functions and classes of the original, as deep copies have.
+        """
+        own = [obj for obj in kept.objects if shares and issubclass(type(obj), type | types.FunctionType)]
+        foreign = frozenset(id(obj) for obj in own if isinstance(obj, type) or is_own(obj))
+        self.freeze()  # finds the simulators
+        self._thaw(kept.layers, kept.nodes, "restore", None, foreign)
 
     def find_simulators(self) -> None:
         """Watch the simulators that are there now: a reset of the environment may exchange its own."""
@@ -191,15 +187,18 @@ class Stack:
                 self.watches.append(watch)
 
     def _freeze_layer(self, freezer: Freezer, layer: Layer, monitor: bool) -> FrozenLayer:
-        if layer.monitor and not monitor:  # it keeps its place, which nodes refer to
-            return FrozenLayer(layer.name, True, None, None, None)
-        adapter = self._adapters.get(id(layer.env))
-        adapted = None if adapter is None else (adapter.capture(layer.env),)
-        attributes = None
+        env, adapter = layer.env, self._adapters.get(id(layer.env))
+        adapted = None if adapter is None else (adapter.capture(env),)
+        attributes = own = cls = None
         if adapter is None or adapter.with_attributes:
-            attributes = freeze_attributes(freezer, layer.env, layer.not_state, adapter is not None)
-        cls = freezer.freeze(type(layer.env)) if adapter is None else None
-        return FrozenLayer(layer.name, layer.monitor, adapted, attributes, cls if type(cls) is Ref else None)
+            attributes = freeze_attributes(freezer, env, layer.not_state, adapter is not None)
+        if layer.monitor and monitor:
+            own = freeze_attributes(freezer, env, _all_but_remembered(layer), False)
+        if adapter is None:
+            cls = freezer.freeze(layer.cls)
+        return FrozenLayer(
+            layer.name, layer.left_out, adapted, attributes, own, cls if type(cls) is Ref else None
+        )
 
     def check(self, frozen: tuple[FrozenLayer, ...]) -> None:
         """Refuse the state of other layers.
@@ -207,26 +206,7 @@ class Stack:
         :param frozen: captured layers.
         :raises SnapshotMismatchError: names the difference.
         """
-        captured_monitors = sum(layer.monitor and layer.attributes is not None for layer in frozen)
-        lacks_monitor = len(self.monitors) > captured_monitors
-        if not lacks_monitor and self._names == [layer.name for layer in frozen]:
-            return
-        ours = [layer.name for layer in self._stateful if not layer.monitor]
-        theirs = [layer.name for layer in frozen if not layer.monitor]
-        if ours[-1] != theirs[-1]:
-            raise SnapshotMismatchError(
-                f"The snapshot is of a {theirs[-1]}, this environment is a {ours[-1]}."
-            )
-        if ours != theirs:
-            raise SnapshotMismatchError(
-                "The wrappers differ, outermost first: "
-                f"{_short(theirs)} in the snapshot, {_short(ours)} around this environment."
-            )
-        if lacks_monitor:
-            raise SnapshotMismatchError(
-                "This environment has a Monitor, and the snapshot is of one without: the episode in progress "
-                "that the Monitor should continue is not in it. Restore it into a clone() instead."
-            )
+        check(self.layers, frozen)
 
     def thaw(self, frozen: tuple[FrozenLayer, ...], nodes: tuple[Node, ...], rng: RngMode) -> None:
         """Put the layers into a captured state.
@@ -244,15 +224,16 @@ class Stack:
         nodes: tuple[Node, ...],
         rng: RngMode,
         originals: list[Any] | None,
+        foreign: frozenset[int] = frozenset(),
     ) -> None:
-        layers = self._pair(frozen)
+        layers = pair(self.layers, frozen)
         known = [layer.env if layer is not None else None for layer in layers]
         for place in reversed(range(len(known) - 1)):
             if known[place] is None:
                 known[place] = known[place + 1]
         places = Places(self._watched or ())
         while True:
-            thawer = Thawer(nodes, KINDS, known, rng, originals, places)
+            thawer = Thawer(nodes, KINDS, known, rng, originals, places, foreign)
             self._plan(thawer, layers, frozen)
             simulators = [thawer.adapted[index] for index in sorted(thawer.adapted)]
             if places.are_of(simulators):
@@ -267,50 +248,51 @@ class Stack:
             adapter = self._adapters.get(id(layer.env))
             if captured.adapted is not None:
                 plan_adapter(thawer, adapter, layer.env, captured.adapted[0])
-            thawer.thaw(captured.cls, type(layer.env))
+            thawer.thaw(captured.cls, layer.cls)
             if captured.attributes is not None:
                 thaw_attributes(thawer, layer.env, layer.not_state, captured.attributes, adapter is None)
-
-    def _pair(self, frozen: tuple[FrozenLayer, ...]) -> list[Layer | None]:
-        """Find for each captured layer the one to restore; None for a Monitor that is not there."""
-        if len(frozen) == len(self._stateful):
-            return list(self._stateful)
-        monitors = iter([layer for layer in self._stateful if layer.monitor])
-        others = iter([layer for layer in self._stateful if not layer.monitor])
-        return [next(monitors, None) if captured.monitor else next(others) for captured in frozen]
+            if captured.own is not None and layer.monitor:
+                thaw_attributes(thawer, layer.env, _all_but_remembered(layer), captured.own, False)
 
     def clone(self) -> gym.Env[Any, Any]:
-        """Copy the layers, without recorders and monitors.
+        """Copy the layers; those that only monitor, draw or record are stand-ins in the copy.
 
         :return: the outermost layer of the copy.
         """
         copies: dict[int, Any] = {}
         copier = Copier(kind_of, copies)
         ordinary: list[Layer] = []
-        below: Any = None
         for layer in reversed(self.layers):
-            if not layer.recorder and not layer.monitor:
-                adapter = self._adapters.get(id(layer.env))
-                if adapter is None:
-                    below = blank(copier.copy(type(layer.env)))
-                    ordinary.append(layer)
-                else:
-                    with globals_kept():
-                        below = adapter.clone(layer.env, copier.copy)
-            copies[id(layer.env)] = below
-        copies[id(self._owner)] = below
+            adapter = self._adapters.get(id(layer.env))
+            if adapter is None:
+                cls = copier.copy(layer.cls)
+                copies[id(layer.env)] = blank(stand_in(cls) if layer.left_out else cls)
+                ordinary.append(layer)
+            else:
+                with globals_kept():
+                    copies[id(layer.env)] = adapter.clone(layer.env, copier.copy)
+        outermost = copies[id(self._owner)] = copies[id(self.layers[0].env)]
         # Simulators first, wherever they hang: attributes may be views into their memory.
-        freezer = Freezer(kind_of, self._refs, len(self._stateful))
-        for layer in ordinary:
-            self._freeze_layer(freezer, layer, monitor=False)
+        freezer = Freezer(kind_of, self._refs, len(self.layers))
+        frozen = [self._freeze_layer(freezer, layer, monitor=False) for layer in ordinary]
+        if not self.incomplete_clones:  # those are completed by what keep() has checked
+            check_held(freezer, frozen)
         for simulator in freezer.adapted:
             copier.copy(simulator)
         for layer in ordinary:
             _copy_attributes(copier, layer)
-        for layer in self.layers[:-1]:
-            if copies[id(layer.env)] is not copies[id(layer.env.env)]:
-                copies[id(layer.env)].env = copies[id(layer.env.env)]
-        return below
+        for layer, below in itertools.pairwise(self.layers):
+            copies[id(layer.env)].env = copies[id(below.env)]
+        return outermost
+
+
+def _all_but_remembered(layer: Layer) -> frozenset[str]:
+    """Name the attributes of a ``Monitor`` that others have set, and those that belong to one instance."""
+    return frozenset(attributes_of(layer.env)) - layer.own | OF_ONE_MONITOR
+
+
+def _is_method_of(layers: list[Layer], obj: Any) -> bool:
+    return type(obj) is types.MethodType and any(obj.__self__ is layer.env for layer in layers)
 
 
 def _with_adapter(layer: Layer) -> Layer:
@@ -318,14 +300,12 @@ def _with_adapter(layer: Layer) -> Layer:
     return layer if adapter is None else layer._replace(not_state=layer.not_state | adapter.not_state)
 
 
-def _short(names: list[str]) -> str:
-    return " > ".join(name.rpartition(".")[2] for name in names)
-
-
 def _copy_attributes(copier: Copier, layer: Layer) -> None:
     attributes: dict[str, Any] = {}
     for name, value in attributes_of(layer.env).items():
-        if name == "render_mode":
+        if name in layer.own:
+            continue
+        if name == "render_mode" or name in layer.drawn:
             attributes[name] = None
         elif name == "_ezpickle_kwargs" and "render_mode" in value:
             attributes[name] = {**value, "render_mode": None}

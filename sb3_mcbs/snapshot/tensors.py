@@ -7,6 +7,7 @@ import numpy as np
 
 from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
 from sb3_mcbs.snapshot.graph import MISSING, Copier, Freezer, Ref, Thawer, class_name
+from sb3_mcbs.snapshot.objects import copy_content, freeze_content, thaw_content
 
 
 def is_tensor(obj: Any) -> bool:
@@ -42,10 +43,11 @@ class TensorKind:
         freezer.tensors.append(obj)
         shared = freezer.owner_of(storage, obj)
         content = bytes_of(obj).copy() if shared is None else shared
-        return content, _layout(obj), freezer.freeze(obj.grad if obj.is_leaf else None)
+        grad = freezer.freeze(obj.grad if obj.is_leaf else None)
+        return content, _layout(obj), grad, freeze_content(freezer, obj)
 
     def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
-        content, layout, grad = payload
+        content, layout, grad, attributes = payload
         if type(content) is Ref:
             storage = thawer.thaw(content).untyped_storage()
             stays = thawer.is_original(index, current) and current.untyped_storage() is storage
@@ -64,6 +66,7 @@ class TensorKind:
         thawed = thawer.thaw(grad, have)
         if thawed is not made.grad:
             thawer.do_then(setattr, made, "grad", thawed)
+        thaw_content(thawer, attributes, made)
         return made
 
     def copy(self, copier: Copier, obj: Any) -> Any:
@@ -72,6 +75,7 @@ class TensorKind:
             copier.enter(storage, storage.clone())
         made = copier.enter(obj, _tensor(copier.memo[id(storage)], _layout(obj)))
         made.grad = copier.copy(obj.grad if obj.is_leaf else None)
+        copy_content(copier, obj, made)
         return made
 
 
@@ -84,6 +88,13 @@ def _storage_of(tensor: Any) -> Any:
     cls = type(tensor)
     if cls not in (torch.Tensor, torch.nn.Parameter) or tensor.layout is not torch.strided:
         raise SnapshotUnsupportedError(f"a {class_name(cls)} of layout {tensor.layout} is no plain tensor")
+    # Their memory alone does not say what they contain.
+    for name in ("quantized", "nested", "meta", "conj", "neg"):
+        answer = getattr(tensor, f"is_{name}")
+        if answer() if callable(answer) else answer:
+            raise SnapshotUnsupportedError(f"a tensor whose is_{name} is true is no plain tensor")
+    if tensor._backward_hooks or getattr(tensor, "_post_accumulate_grad_hooks", None):
+        raise SnapshotUnsupportedError("a tensor with hooks is no plain tensor")
     if tensor.grad_fn is not None:
         raise SnapshotUnsupportedError("it is a tensor with a history of gradients; keep its detach()")
     return tensor.untyped_storage()

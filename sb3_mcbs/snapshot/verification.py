@@ -34,7 +34,12 @@ TRIES = 10
 _KNOWN_ENVIRONMENTS = tuple(
     f"gymnasium.envs.{part}." for part in ("mujoco", "classic_control", "box2d", "toy_text")
 )
-_KNOWN_WRAPPERS = ("gymnasium.wrappers.", "stable_baselines3.common.monitor.", "rl_zoo3.gym_patches.")
+_KNOWN_WRAPPERS = (
+    "gymnasium.wrappers.",
+    "stable_baselines3.common.monitor.",
+    "rl_zoo3.gym_patches.",
+    "sb3_mcbs.snapshot.wrapper.",
+)
 #: They call a function that is not known.
 _CALLING_WRAPPERS = {
     f"gymnasium.wrappers.{module}.{name}"
@@ -131,7 +136,7 @@ def is_known_exact(layers: Sequence[Layer], own_adapters: tuple[type, ...]) -> b
         if adapter is not None and type(adapter) not in own_adapters:
             return False
         known = _KNOWN_WRAPPERS if isinstance(layer.env, gym.Wrapper) else _KNOWN_ENVIRONMENTS
-        if not layer.recorder and (not layer.name.startswith(known) or layer.name in _CALLING_WRAPPERS):
+        if not layer.name.startswith(known) or layer.name in _CALLING_WRAPPERS:
             return False
         if replaced_method(layer.env) is not None:
             return False

@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,9 +13,14 @@ from sb3_mcbs.snapshot.errors import SnapshotError, SnapshotMismatchError, Snaps
 from sb3_mcbs.snapshot.faults import diverged_step
 from sb3_mcbs.snapshot.graph import Node, RngMode, private_copy
 from sb3_mcbs.snapshot.layers import describe_space
+from sb3_mcbs.snapshot.pairing import FrozenLayer
+from sb3_mcbs.snapshot.pygame_values import display_kept
 from sb3_mcbs.snapshot.replay import Box2DAdapter
-from sb3_mcbs.snapshot.state import FrozenLayer, Stack
+from sb3_mcbs.snapshot.state import Stack
 from sb3_mcbs.snapshot.verification import CannotResetError, check_exact, has_passed, is_known_exact
+
+# Names of an attribute, and of what only pickles have.
+_STACK, _KEPT = "_known_stack", "_kept_state"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,6 +99,7 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
         below = [layer.env for layer in self._stack.layers if isinstance(layer.env, SnapshotEnvWrapper)]
         self.verifies = verify and all(wrapper.verifies for wrapper in below)
         self._verified = not self.verifies
+        self._is_copy = False
         self._spaces = (describe_space(self.observation_space), describe_space(self.action_space))
         # Whatever cannot be captured is better known before training than in the middle of it.
         self._stack.freeze()
@@ -106,13 +113,29 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
         else:
             setattr(self.env, name, value)
 
+    # Deep copies and pickles of many environments are made by their constructor. Those of this wrapper are in
+    # the same state besides. The layers are known by their identity, which a copy does not share.
+
     def __getstate__(self) -> dict[str, Any]:
-        # It knows the layers by their identity, which a copy does not share.
-        return {name: value for name, value in vars(self).items() if name != "_known_stack"}
+        state = {name: value for name, value in vars(self).items() if name != _STACK}
+        if self.last_observation is not None:
+            kept = self._stack.keep(monitor=True)
+            state[_KEPT] = kept._replace(objects=[])
+        return state
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state)
-        vars(self)["_known_stack"] = None
+        kept = state.pop(_KEPT, None)
+        vars(self).update(state, **{_STACK: None})
+        if kept is not None:
+            self._stack.become(kept, shares=False)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "SnapshotEnvWrapper":
+        made = memo[id(self)] = type(self).__new__(type(self))
+        attributes = {name: value for name, value in vars(self).items() if name != _STACK}
+        vars(made).update(deepcopy(attributes, memo), **{_STACK: None})
+        if self.last_observation is not None:
+            made._stack.become(self._stack.keep(monitor=True), shares=True)
+        return made
 
     @property
     def _stack(self) -> Stack:
@@ -134,6 +157,7 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
             "seed": self.reset_arguments["seed"] if seed is None else seed,
             "options": options,
         }
+        _ = self._stack  # adapters prepare the environment
         observation, info = self.env.reset(seed=seed, options=options)
         self.last_observation = private_copy(observation)
         self.moment = (self.moment[0] + 1, 0)
@@ -167,13 +191,9 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
 
     def _check(self) -> None:
         stack = self._stack
-        kept = stack.keep(monitor=False)
-        with stack.bare() as bare:
-            try:
-                checked = _CheckedEnvironment(stack, bare, self.reset_arguments)
-                check_exact(checked, stack.layers, self.action_space)
-            finally:
-                stack.put_back(kept)
+        with stack.bare():
+            checked = _CheckedEnvironment(stack, self.env, self.reset_arguments)
+            check_exact(checked, stack.layers, self.action_space)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Step the environment.
@@ -242,8 +262,9 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
         """Make an independent copy of the environment in its present state.
 
         The copy carries the present values of attributes and simulator, edited models included. It does not
-        render, writes no files and is not monitored: ``render_mode`` is None, and SB3's ``Monitor`` and
-        recording wrappers are left out. Neither this environment nor any global generator is touched.
+        render, writes no files and is not monitored: ``render_mode`` is None, and in the place of SB3's
+        ``Monitor`` and of recording wrappers is what only holds what others have set on them. Neither this
+        environment nor any global generator is touched.
 
         :return: the copy, wrapped.
         """
@@ -253,6 +274,11 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
         copy.reset_arguments = self.reset_arguments
         copy.last_observation = private_copy(self.last_observation)
         return copy
+
+    def close(self) -> None:
+        """Close the environment. A copy has no window, and leaves those of others alone."""
+        with display_kept() if self._is_copy else contextlib.nullcontext():
+            super().close()
 
     def apply(self, function: Callable[..., Any], *args: Any) -> Any:
         """Call a function with this wrapper: lets ``env_method`` run it where the environment lives.
@@ -267,6 +293,7 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
 
 def _clone(stack: Stack) -> SnapshotEnvWrapper:
     copy = SnapshotEnvWrapper(stack.clone(), verify=False)
+    copy._is_copy = True
     if stack.incomplete_clones:
         layers, nodes = stack.freeze(monitor=False)
         copy._stack.thaw(layers, nodes, "restore")

@@ -44,6 +44,7 @@ class SearchTrialEvalCallback(ActsWithSearch, TrialEvalCallback):
         if self.eval_idx > evaluations and isinstance(self.model, SearchPolicy):
             self.trial.set_user_attr("search/decisions", int(self.model.n_decisions))
             self.trial.set_user_attr("search/simulated_steps", int(self.model.n_simulated_steps))
+            self.trial.set_user_attr("search/invalid_rollouts", int(self.model.n_invalid_rollouts))
         return continue_training
 
 

@@ -3,7 +3,6 @@
 import inspect
 import sys
 from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,17 +13,15 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_mcbs.algorithms.keywords import SETTING_NAMES
-from sb3_mcbs.algorithms.rollout_replay import RolloutReplaySettings
-from sb3_mcbs.algorithms.value_expansion import ValueExpansionSettings
+from sb3_mcbs.algorithms.keywords import SETTING_NAMES, settings_of_preset
 from sb3_mcbs.checkpoints import CheckpointError, ExactCheckpointCallback
 from sb3_mcbs.checkpoints.resume import continue_with
 from sb3_mcbs.checkpoints.resumption import Resumption
 from sb3_mcbs.models import ForwardModelError
 from sb3_mcbs.models.factory import KINDS
-from sb3_mcbs.search import PRESETS, ScheduleSettings, SearchSettings, with_preset
+from sb3_mcbs.search import PRESETS, SearchSettings, with_preset
 from sb3_mcbs.search.schedule import SCHEDULES, UNITS
-from sb3_mcbs.search.settings import MATMUL_PRECISIONS, OF_THE_MACHINE, STRATEGIES, TQC_VALUES
+from sb3_mcbs.search.settings import MATMUL_PRECISIONS, STRATEGIES, TQC_VALUES
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 from sb3_mcbs.zoo.callbacks import SearchEvalCallback, SecondEvalCallback
 from sb3_mcbs.zoo.paths import PathError, hyperparams_path, sibling_folder
@@ -131,7 +128,7 @@ class MCBSExperimentManager(ExperimentManager):
                 raise ValueError(
                     "Trials draw the search's settings and know no preset: leave preset out of -params."
                 )
-            self.custom_hyperparams = {**_settings_of_preset(custom["preset"]), **custom}
+            self.custom_hyperparams = {**settings_of_preset(custom["preset"]), **custom}
         return super().read_hyperparameters()
 
     def _preprocess_hyperparams(
@@ -213,24 +210,6 @@ def _check_names(custom: dict[str, Any]) -> None:
             sys.exit(f"-params {name}:{value}: must be a number, True, False or None.")
         if value not in NAMES[name]:
             sys.exit(f"-params {name}:{value}: there is no such {name}; known are {', '.join(NAMES[name])}.")
-
-
-def _settings_of_preset(name: str) -> dict[str, Any]:
-    """
-    What a preset of the command line replaces in a hyperparameter file.
-
-    :param name: of the preset
-    :return: every setting of how is searched; for "paper", which is Algorithm 1 at every step, also those of
-        when is searched, what is learned from simulations and whether searched actions get noise
-    """
-    settings = asdict(SearchSettings.preset(name))
-    for setting in OF_THE_MACHINE:
-        del settings[setting]
-    if name == "paper":
-        for defaults in (ScheduleSettings(), RolloutReplaySettings(), ValueExpansionSettings()):
-            settings |= asdict(defaults)
-        settings["action_noise_after_search"] = False
-    return settings
 
 
 def _checked_search_evaluation(settings: Any, algo: str) -> dict[str, Any]:

@@ -1,0 +1,116 @@
+"""What takes the place of wrappers that copies are made without: SB3's ``Monitor``, and those that record."""
+
+import dis
+import functools
+import types
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import gymnasium as gym
+
+from sb3_mcbs.snapshot.graph import class_name
+
+MONITOR = "stable_baselines3.common.monitor.Monitor"
+_LEFT_OUT = frozenset(
+    {
+        MONITOR,
+        "gymnasium.wrappers.rendering.RecordVideo",
+        "gymnasium.wrappers.rendering.RenderCollection",
+        "gymnasium.wrappers.rendering.HumanRendering",
+        "sb3_mcbs.snapshot.wrapper.SnapshotEnvWrapper",
+    }
+)
+
+
+@functools.lru_cache(maxsize=256)
+def left_out_class(cls: type) -> type | None:
+    """Return which of the wrappers that copies are made without a class is, or derives from.
+
+    :param cls: the class of a wrapper.
+    """
+    return next((base for base in cls.__mro__ if class_name(base) in _LEFT_OUT), None)
+
+
+@functools.lru_cache(maxsize=64)
+def set_by(cls: type) -> frozenset[str]:
+    """Name the attributes that the methods of a class set on its objects. All else was set by others.
+
+    :param cls: the class.
+    """
+    methods = [member for member in vars(cls).values() if isinstance(member, types.FunctionType)]
+    return frozenset(name for method in methods for name in _stored(method.__code__))
+
+
+def _stored(code: types.CodeType) -> Iterator[str]:
+    for instruction in dis.get_instructions(code):
+        if instruction.opname == "STORE_ATTR":
+            yield instruction.argval
+    for constant in code.co_consts:
+        if isinstance(constant, types.CodeType):
+            yield from _stored(constant)
+
+
+class StandIn(gym.Wrapper[Any, Any, Any, Any]):
+    """Takes a wrapper's place in a copy. It holds what others have set on that, and does nothing itself."""
+
+    stands_for: type
+
+    def __getattr__(self, name: str) -> Any:
+        stands_for = type(self).stands_for.__name__
+        raise AttributeError(
+            f"copies of an environment are made without its {stands_for}, and what stands in its place has "
+            f"no attribute {name!r}"
+        )
+
+    def __reduce__(self) -> tuple[Callable[..., Any], tuple[type], dict[str, Any]]:
+        return _blank, (type(self).stands_for,), vars(self)
+
+
+def _blank(cls: type) -> Any:
+    return object.__new__(stand_in(cls))
+
+
+@functools.lru_cache(maxsize=64)
+def stand_in(cls: type) -> type[StandIn]:
+    """Return the class of what takes a wrapper's place.
+
+    :param cls: the wrapper's class. What a derived class does besides the one that it derives from stays.
+    """
+    known = left_out_class(cls)
+    assert known is not None
+    bases: tuple[Any, ...] = (StandIn,)
+    if cls is not known:
+        passed_on = {name: vars(gym.Wrapper)[name] for name in ("reset", "step", "render", "close")}
+        bases = (StandIn, cls, type(known.__name__, (known,), passed_on))
+    return type(f"StandIn{cls.__name__}", bases, {"stands_for": cls, "__module__": __name__})
+
+
+def function_of(method: types.MethodType) -> Any:
+    """Return the function of a bound method; of a stand-in's own, that of what it stands for.
+
+    :param method: the method.
+    """
+    cls = type(method.__self__)
+    if issubclass(cls, StandIn):
+        return _exchanged(method.__func__, cls, cls.stands_for)
+    return method.__func__
+
+
+def bound(function: Any, owner: Any) -> Any:
+    """Bind a function to an object, as a method.
+
+    :param function: of :func:`function_of`.
+    :param owner: the object. A stand-in has methods of its own instead of those of what it stands for.
+    """
+    cls = type(owner)
+    if issubclass(cls, StandIn):
+        function = _exchanged(function, cls.stands_for, cls)
+    return types.MethodType(function, owner)
+
+
+def _exchanged(function: Any, cls: type, other: type) -> Any:
+    """Return what another class has for a method of one; a function that is none of its methods stays."""
+    name, code = getattr(function, "__name__", ""), getattr(function, "__code__", None)
+    if code is None or getattr(getattr(cls, name, None), "__code__", None) is not code:
+        return function
+    return getattr(other, name, function)

@@ -1,0 +1,251 @@
+"""Settings that are set as attributes of an agent, or given to ``load``: they hold, or are refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_mcbs import MCBSSAC, MCBSTD3, MCBSTQC, SearchPolicy
+from sb3_mcbs.search import PRESETS, ScheduleSettings, SearchSettings
+from tests.checkpoint_helpers import assert_resumed_is_exact
+from tests.conftest import SEARCHING, SMALL, SMALL_SEARCH, assert_same_parameters, snapshot_vec_env
+
+CHANGES = [
+    (MCBSTD3, dict(beam_width=5)),
+    (MCBSTD3, dict(rollout_depth=0)),
+    (MCBSTD3, dict(rollout_depth=3, n_simulations=1, beam_noise=0.3, rollout_noise=0.0, noise_clip=0.4)),
+    (MCBSTD3, dict(strategy="refine", rollout_depth=3)),
+    (MCBSTD3, dict(strategy="tree", branching=2)),
+    (MCBSTD3, dict(include_policy_action=True, antithetic=True, common_noise=True)),
+    (MCBSTD3, dict(n_threads=2, forward_model="pool", matmul_precision="high")),
+    (MCBSTD3, dict(proposal_dims=1, n_proposals=6, noise_hold=2)),
+    (MCBSTD3, dict(search_share=0.5, search_unit="episode")),
+    (MCBSTD3, dict(search_schedule="saturation", final_search_share=0.1, saturation_window=20)),
+    (MCBSTD3, dict(search_schedule="anneal", final_beam_width=1, final_rollout_depth=1)),
+    (MCBSSAC, dict(entropy_bonus=True)),
+    (MCBSTQC, dict(tqc_value="truncated")),
+]
+
+
+def change(agent, changes: dict) -> None:
+    if "search_schedule" in changes:  # which has no meaning without the others, nor they without it
+        agent.schedule_settings = ScheduleSettings(**changes)
+        return
+    for name, value in changes.items():
+        setattr(agent, name, value)
+
+
+def trained(agent, steps: int = 60, **kwargs):
+    """Train an agent, whatever has drawn from the global generators since it was made."""
+    agent.set_random_seed(3)
+    return agent.learn(steps, **kwargs)
+
+
+class SetsAttributes(BaseCallback):
+    """Sets attributes of the agent at some step, as a user's callback does."""
+
+    not_checkpointed = ("changes",)
+
+    def __init__(self, step: int, changes: dict) -> None:
+        super().__init__()
+        self.step = step
+        self.changes = changes
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps == self.step:
+            change(self.model, self.changes)
+        return True
+
+
+def assert_same_training(left, right) -> None:
+    assert_same_parameters(left, right)
+    for name in ("observations", "actions", "rewards"):
+        np.testing.assert_array_equal(
+            *(getattr(agent.replay_buffer, name) for agent in (left, right)), err_msg=name
+        )
+    assert left.n_simulated_steps == right.n_simulated_steps and left.n_decisions == right.n_decisions
+
+
+@pytest.mark.parametrize(("cls", "changes"), CHANGES)
+def test_set_later_is_as_set_at_construction(make_agent, cls, changes):
+    made, changed = make_agent(cls=cls, **changes), make_agent(cls=cls)
+    change(changed, changes)
+    assert changed.search_settings == made.search_settings
+    assert_same_training(trained(made), trained(changed))
+    assert changed.logger.name_to_value.keys() == made.logger.name_to_value.keys()
+
+
+@pytest.mark.parametrize(("cls", "changes"), CHANGES)
+def test_a_callback_may_change_settings_while_training(make_agent, cls, changes):
+    agent = trained(make_agent(cls=cls), callback=SetsAttributes(40, changes))
+    assert agent.search_settings == make_agent(cls=cls, **changes).search_settings
+    untouched = trained(make_agent(cls=cls))
+    rows = [each.replay_buffer.actions[:60] for each in (agent, untouched)]
+    np.testing.assert_array_equal(rows[0][:40], rows[1][:40])
+    # Untrained critics rate the best candidate highest with and without their highest quantiles.
+    assert np.array_equal(*rows) == ("n_threads" in changes or "tqc_value" in changes)
+
+
+def test_a_changed_width_holds_from_the_next_decision_on(make_agent):
+    agent = make_agent(beam_width=2, rollout_depth=1, n_simulations=1).learn(40)
+    assert agent.n_simulated_steps == 20 * 2
+    agent.beam_width = np.int64(7)
+    agent.learn(10, reset_num_timesteps=False)
+    assert agent.n_simulated_steps == 20 * 2 + 10 * 7
+    assert agent.logger.name_to_value["search/beam_width"] == 7
+    agent.search_share = 0.0
+    agent.learn(10, reset_num_timesteps=False)
+    assert agent.n_simulated_steps == 20 * 2 + 10 * 7
+    agent.search_share = 1
+    agent.learn(10, reset_num_timesteps=False)
+    assert agent.n_simulated_steps == 20 * 2 + 20 * 7
+
+
+@pytest.mark.parametrize("cls", SEARCHING)
+def test_wrong_values_are_refused_at_once_and_change_nothing(make_agent, cls):
+    agent, untouched = make_agent(cls=cls), trained(make_agent(cls=cls))
+    before = agent.search_settings, agent.schedule_settings
+    for name, value, error, match in (
+        ("strategy", "nonsense", ValueError, "strategy must be one of"),
+        ("strategy", ["tree"], ValueError, "strategy must be one of"),
+        ("beam_width", 0, ValueError, "beam_width must be between 1"),
+        ("beam_width", 2.5, TypeError, "beam_width must be an integer"),
+        ("beam_noise", 0.0, ValueError, "beam_width above 1 needs a beam_noise above 0"),
+        ("beam_noise", float("nan"), ValueError, "beam_noise must be finite"),
+        ("max_beam_width", 9, ValueError, "max_beam_width needs a time_budget"),
+        ("proposal_dims", 2, ValueError, "proposal_dims must be at most 1"),
+        ("search_share", 1.5, ValueError, "search_share must be finite"),
+        ("final_search_share", 0.5, ValueError, "final_search_share has no meaning"),
+        ("action_noise_after_search", "yes", TypeError, "action_noise_after_search"),
+        ("preset", "quick", ValueError, "There is no preset 'quick'"),
+        ("value_expansion", 2, ValueError, "not from or to 0"),
+        ("rollout_replay", 0.5, ValueError, "rollout_replay keeps equally many"),
+        ("forward_model", "ensemble", ValueError, "decided when it is made or loaded"),
+        ("forward_model", "mujoco", Exception, "environment 0"),
+        ("ensemble_size", 1, ValueError, "ensemble_size must be between 2"),
+        ("search_settings", {"beam_width": 3}, TypeError, "Expected SearchSettings"),
+    ):
+        with pytest.raises(error, match=match):
+            setattr(agent, name, value)
+    assert (agent.search_settings, agent.schedule_settings) == before and agent.preset is None
+    assert_same_training(trained(agent), untouched)
+
+
+def test_what_is_kept_beside_the_replay_buffer_stays_as_it_is(make_agent):
+    agent = make_agent("InvertedPendulum-v5", value_expansion=1, expanded_share=0.5, rollout_replay=0.2)
+    for name, value in (("beam_width", 4), ("n_simulations", 1), ("rollout_depth", 1), ("rollout_replay", 0)):
+        with pytest.raises(ValueError, match="rollout_replay keeps equally many"):
+            setattr(agent, name, value)
+    with pytest.raises(ValueError, match="not from or to 0"):
+        agent.value_expansion = 0
+    agent.value_expansion, agent.expanded_share, agent.rollout_replay = 2, 0.25, 0.5
+    made = make_agent("InvertedPendulum-v5", value_expansion=2, expanded_share=0.25, rollout_replay=0.5)
+    assert_same_training(trained(agent), trained(made))
+
+
+def test_all_settings_change_at_once(make_agent):
+    agent = make_agent(beam_width=1, beam_noise=0.0, rollout_noise=0.1, search_share=0.5)
+    with pytest.raises(ValueError, match="beam_noise above 0"):
+        agent.strategy = "refine"
+    agent.search_settings = replace(agent.search_settings, strategy="refine", beam_width=4, beam_noise=0.1)
+    agent.schedule_settings = ScheduleSettings(search_share=0.25)
+    assert (agent.strategy, agent.beam_width, agent.search_share) == ("refine", 4, 0.25)
+    agent.learn(60)
+    assert 0 < agent.n_decisions < 40
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_preset_can_be_set_later_and_when_loading(tmp_path, preset):
+    expected, before = SearchSettings.preset(preset, n_threads=1), "paper" if preset == "strong" else "strong"
+    env = snapshot_vec_env("Pendulum-v1")
+    agent = MCBSTD3("MlpPolicy", env, preset=before, search_share=0.5, n_threads=1, **SMALL)
+    agent.save(tmp_path / "agent")
+    agent.preset = preset
+    loaded = MCBSTD3.load(tmp_path / "agent", snapshot_vec_env("Pendulum-v1"), device="cpu", preset=preset)
+    for each in (agent, loaded):
+        assert (each.preset, each.search_settings) == (preset, expected)
+        assert each.search_share == (1.0 if preset == "paper" else 0.5)  # Algorithm 1 is at every step
+    changed = MCBSTD3.load(tmp_path / "agent", device="cpu", preset=preset, beam_width=9)
+    assert changed.search_settings == replace(expected, beam_width=9)
+    without = MCBSTD3.load(tmp_path / "agent", device="cpu", preset=None)
+    assert without.preset is None
+    loaded.learn(110)
+
+
+def test_changed_settings_are_saved(make_agent, tmp_path):
+    agent = make_agent()
+    agent.beam_width, agent.search_share = 8, 0.5
+    agent.save(tmp_path / "agent")
+    loaded = MCBSTD3.load(tmp_path / "agent", snapshot_vec_env("Pendulum-v1"), device="cpu")
+    assert (loaded.beam_width, loaded.search_share) == (8, 0.5)
+    loaded.strategy = "tree"
+    assert loaded.learn(40).search_settings.strategy == "tree"
+
+
+def test_where_the_schedule_starts_to_leave_the_search_out_the_actor_explores(make_agent):
+    agent = make_agent(gradient_steps=0, train_freq=1000)
+    agent.learn(60, callback=SetsAttributes(30, dict(search_share=0.0)))
+    observations, actions = agent.replay_buffer.observations[31:60, 0], agent.replay_buffer.actions[31:60, 0]
+    noise = actions - agent.policy.scale_action(agent.predict(observations)[0])
+    assert agent.n_decisions == 10 and 0.02 < noise.std() < 0.3
+
+
+@pytest.mark.parametrize("changes", [dict(beam_width=5), dict(strategy="refine"), dict(search_share=0.3)])
+def test_a_resumed_run_goes_on_with_the_changed_settings(tmp_path, changes):
+    def make(folder):
+        env = snapshot_vec_env("Pendulum-v1")
+        return MCBSTD3("MlpPolicy", env, seed=0, learning_starts=20, **SMALL, **SMALL_SEARCH)
+
+    def more(folder):
+        return [SetsAttributes(50, changes)]
+
+    agents = assert_resumed_is_exact(make, tmp_path, more=more)
+    for agent in agents:
+        assert {name: getattr(agent, name) for name in changes} == changes
+        assert agent._searcher.settings == agent.search_settings
+
+
+def test_settings_of_a_search_policy_are_attributes(make_agent):
+    agent = make_agent()
+    env = agent.get_env()
+    policy = SearchPolicy(agent, env, seed=0, beam_width=2)
+    observation = env.reset()
+
+    def simulated() -> int:
+        policy.predict(observation)
+        return policy.last_result.simulated_steps
+
+    assert (policy.beam_width, agent.beam_width, simulated()) == (2, 3, 2 + 2 * 2)
+    policy.beam_width = 5
+    assert (policy.beam_width, agent.beam_width, simulated()) == (5, 3, 5 + 2 * 5)
+    policy.rollout_depth = 0
+    assert simulated() == 0
+    policy.settings = SearchSettings(strategy="tree", beam_width=2, branching=3, rollout_depth=2, n_threads=1)
+    assert simulated() == policy.settings.simulated_steps() == 12
+    policy.preset = "efficient"
+    assert policy.settings == SearchSettings.preset("efficient", n_threads=1) and simulated() == 18
+    expected = SearchPolicy(agent, env, seed=1, preset="efficient", n_threads=1)
+    policy.rng = np.random.default_rng(1)
+    np.testing.assert_array_equal(policy.predict(observation)[0], expected.predict(observation)[0])
+
+
+def test_what_a_search_policy_does_not_follow_is_refused(make_agent):
+    agent, other = make_agent(), make_agent()
+    policy = SearchPolicy(agent, agent.get_env(), seed=0)
+    before = policy.settings
+    for name, value, error, match in (
+        ("strategy", "nonsense", ValueError, "strategy must be one of"),
+        ("proposal_dims", 2, ValueError, "proposal_dims must be at most 1"),
+        ("forward_model", "mujoco", Exception, "environment 0"),
+        ("settings", {"beam_width": 3}, TypeError, "Expected SearchSettings"),
+        ("preset", "quick", ValueError, "There is no preset 'quick'"),
+        ("vec_env", other.get_env(), AttributeError, "vec_env of a SearchPolicy cannot be exchanged"),
+        ("model", other, AttributeError, "model of a SearchPolicy cannot be exchanged"),
+    ):
+        with pytest.raises(error, match=match):
+            setattr(policy, name, value)
+    assert policy.settings == before
+    policy.predict(agent.get_env().reset())
+    policy.gamma = 0.5
+    assert agent.gamma == 0.5, "attributes of the agent are set where they are read"
