@@ -8,7 +8,7 @@ import torch as th
 from stable_baselines3 import TD3
 
 from benchmarks.common import alternate, machine, parse_args, print_table, timed, write
-from sb3_mcbs.algorithms.td3_update import TD3Update
+from sb3_mcbs.networks.td3_update import TD3Update
 
 NETWORKS = ([32, 32], [64, 64], [256, 256], [400, 300], [512, 512, 512])
 BATCHES = (16, 64, 256, 1024)

@@ -19,7 +19,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from benchmarks.common import parse_args, write
 from benchmarks.learned_model import error_over_horizon, evaluate
 from benchmarks.trained_agent import ALGOS, load_agent
-from sb3_mcbs.algorithms.learned_model import HELD_OUT_EVERY, EnsembleSettings, LearnedModel
+from sb3_mcbs.agents.learned_model import HELD_OUT_EVERY, EnsembleSettings, LearnedModel
 from sb3_mcbs.models import Transitions
 
 

@@ -9,7 +9,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_mcbs import MCBSTD3
-from sb3_mcbs.algorithms.td3_update import FastUpdate, TD3Update
+from sb3_mcbs.networks.td3_update import FastUpdate, TD3Update
 from sb3_mcbs.search import search
 from sb3_mcbs.search.strategies import Decision
 

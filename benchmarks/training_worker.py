@@ -56,7 +56,7 @@ def make_agent(arm: str, env_id: str, n_envs: int) -> Any:
     if arm == "SB3 TD3":
         return TD3("MlpPolicy", env, **common)
     if arm == "SB3 TD3, our update":
-        from sb3_mcbs.algorithms.td3_update import TD3Update
+        from sb3_mcbs.networks.td3_update import TD3Update
 
         agent = TD3("MlpPolicy", env, **common)
         agent.train = TD3Update(agent).train  # type: ignore[assignment, method-assign]

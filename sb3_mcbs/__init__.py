@@ -2,20 +2,10 @@
 
 from importlib.metadata import PackageNotFoundError, version
 
-from sb3_mcbs.algorithms import (
-    MCBS,
-    MCBSDDPG,
-    MCBSSAC,
-    MCBSTD3,
-    MCBSTQC,
-    AgentFileError,
-    SearchPolicy,
-    load_agent,
-    load_statistics,
-    save_statistics,
-)
-from sb3_mcbs.algorithms.faults import NonFiniteError
+from sb3_mcbs.agents import MCBS, MCBSDDPG, MCBSSAC, MCBSTD3, MCBSTQC, SearchPolicy
+from sb3_mcbs.agents.faults import NonFiniteError
 from sb3_mcbs.checkpoints import CheckpointError, ExactCheckpointCallback, resume
+from sb3_mcbs.loading import AgentFileError, load_agent, load_statistics, save_statistics
 from sb3_mcbs.models import WorkerError
 from sb3_mcbs.search import SearchSettings
 from sb3_mcbs.snapshot import SnapshotEnvWrapper

@@ -14,7 +14,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_mcbs import MCBS, MCBSDDPG, MCBSSAC, MCBSTD3, MCBSTQC, SnapshotEnvWrapper
-from sb3_mcbs.algorithms import learned_model
+from sb3_mcbs.agents import learned_model
 from sb3_mcbs.models import ensemble, ensemble_network
 from sb3_mcbs.snapshot import registry, verification
 

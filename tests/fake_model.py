@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sb3_mcbs.models.base import ForwardModel, Transition
+from sb3_mcbs.types import ForwardModel, Transition
 
 
 class LineWorld(ForwardModel):

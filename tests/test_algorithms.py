@@ -7,8 +7,8 @@ from typing import get_type_hints
 import pytest
 
 from sb3_mcbs import MCBS, MCBSSAC
-from sb3_mcbs.algorithms.keywords import SearchKeywords, setting_fields
-from sb3_mcbs.algorithms.td3_update import FastUpdate
+from sb3_mcbs.agents.hyperparameters import SearchKeywords, setting_fields
+from sb3_mcbs.networks.td3_update import FastUpdate
 from tests.conftest import SEARCHING, SMALL_SEARCH, WITHOUT_SEARCH
 
 

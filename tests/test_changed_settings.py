@@ -7,7 +7,8 @@ import pytest
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_mcbs import MCBSSAC, MCBSTD3, MCBSTQC, SearchPolicy
-from sb3_mcbs.search import PRESETS, ScheduleSettings, SearchSettings
+from sb3_mcbs.agents.schedule import ScheduleSettings
+from sb3_mcbs.search import PRESETS, SearchSettings
 from tests.checkpoint_helpers import assert_resumed_is_exact
 from tests.conftest import SEARCHING, SMALL, SMALL_SEARCH, assert_same_parameters, snapshot_vec_env
 

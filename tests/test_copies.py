@@ -14,7 +14,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 
 from sb3_mcbs import MCBSSAC, MCBSTD3, SearchPolicy, SnapshotEnvWrapper
-from sb3_mcbs.algorithms import torch_settings
+from sb3_mcbs.networks import torch_settings
 from tests.conftest import SEARCHING, assert_same_parameters, snapshot_vec_env
 
 COPIES = {

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from sb3_mcbs import MCBSTD3, SearchPolicy, SearchSettings
-from sb3_mcbs.algorithms.rollout_replay import RolloutReplaySettings
-from sb3_mcbs.algorithms.searcher import Searcher
+from sb3_mcbs.agents.planner import Searcher
+from sb3_mcbs.agents.rollout_replay import RolloutReplaySettings
 from sb3_mcbs.search import (
     Decision,
     PlanMemory,

@@ -19,8 +19,8 @@ from stable_baselines3.common.vec_env import (
 )
 
 from sb3_mcbs import MCBSSAC, MCBSTD3, SearchPolicy, SnapshotEnvWrapper, load_agent
-from sb3_mcbs.algorithms import vec_env_view
-from sb3_mcbs.algorithms.learned_model import read_transitions
+from sb3_mcbs.agents import observation_pipeline
+from sb3_mcbs.agents.learned_model import read_transitions
 from sb3_mcbs.models import ForwardModelError
 from sb3_mcbs.snapshot import SnapshotUnsupportedError
 from tests.checkpoint_helpers import assert_resumed_is_exact
@@ -52,7 +52,7 @@ def no_snapshots(monkeypatch):
         raise AssertionError("no snapshot is wanted")
 
     monkeypatch.setattr(SnapshotEnvWrapper, "__init__", refuse)
-    monkeypatch.setattr(vec_env_view, "snapshot_environments", refuse)
+    monkeypatch.setattr(observation_pipeline, "snapshot_environments", refuse)
 
 
 @pytest.fixture

@@ -16,7 +16,8 @@ from stable_baselines3.common.env_util import make_vec_env
 from torch import nn
 
 from sb3_mcbs import MCBSSAC, MCBSTD3, MCBSTQC, AgentFileError, SearchPolicy, load_agent
-from sb3_mcbs.algorithms import agent_file, networks
+from sb3_mcbs.loading import agent_file
+from sb3_mcbs.networks import functions as networks
 from tests import agent_files as files
 from tests.conftest import SEARCHING, SMALL_SEARCH, assert_same_parameters
 

@@ -16,7 +16,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_mcbs import MCBSTD3, AgentFileError, load_agent
-from sb3_mcbs.algorithms import agent_file, archive
+from sb3_mcbs.loading import agent_file, archive
 from tests import agent_files as files
 
 

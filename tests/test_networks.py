@@ -13,10 +13,10 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 
 from sb3_mcbs import MCBSTD3, SearchPolicy
-from sb3_mcbs.algorithms.mlp import MLP
-from sb3_mcbs.algorithms.networks import entropy_function, policy_function, value_function
-from sb3_mcbs.algorithms.plain_networks import actor_mlp
-from sb3_mcbs.algorithms.torch_settings import matmul_precision, one_thread
+from sb3_mcbs.networks.functions import entropy_function, policy_function, value_function
+from sb3_mcbs.networks.mlp import MLP
+from sb3_mcbs.networks.plain_networks import actor_mlp
+from sb3_mcbs.networks.torch_settings import matmul_precision, one_thread
 from tests.conftest import SEARCHING, SMALL, WITHOUT_SEARCH
 
 

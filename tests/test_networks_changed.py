@@ -11,7 +11,7 @@ from torch import nn
 from torch.nn.utils import prune
 
 from sb3_mcbs import MCBSDDPG, MCBSSAC, MCBSTD3, MCBSTQC, SearchPolicy
-from sb3_mcbs.algorithms.value_expansion import ValueExpansion
+from sb3_mcbs.agents.value_expansion import ValueExpansion
 from tests.conftest import SEARCHING, WITHOUT_SEARCH, snapshot_vec_env
 
 

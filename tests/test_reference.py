@@ -11,7 +11,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_mcbs import MCBSDDPG, MCBSSAC, MCBSTD3, MCBSTQC, SearchSettings
-from sb3_mcbs.algorithms.searcher import Searcher
+from sb3_mcbs.agents.planner import Searcher
 from sb3_mcbs.search import beam_search, draw_noise
 from tests.conftest import SMALL
 from tests.reference_search import Reference

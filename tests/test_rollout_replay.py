@@ -10,7 +10,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_mcbs import MCBSTD3
-from sb3_mcbs.algorithms.rollout_replay import RolloutReplay
+from sb3_mcbs.agents.rollout_replay import RolloutReplay
 from sb3_mcbs.search import Rollouts, SearchSettings, beam_search, draw_noise
 from tests.checkpoint_helpers import assert_resumed_is_exact
 from tests.conftest import SEARCHING, snapshot_vec_env

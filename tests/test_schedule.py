@@ -7,7 +7,8 @@ from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckA
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 
 from sb3_mcbs import MCBSSAC, MCBSTD3, MCBSTQC
-from sb3_mcbs.search import ScheduleSettings, SearchSchedule, SearchSettings, draw_noise
+from sb3_mcbs.agents.schedule import ScheduleSettings, SearchSchedule
+from sb3_mcbs.search import SearchSettings, draw_noise
 from sb3_mcbs.search.streams import stream
 from tests.checkpoint_helpers import assert_resumed_is_exact
 from tests.conftest import SEARCHING, WITHOUT_SEARCH, assert_same_parameters, snapshot_vec_env

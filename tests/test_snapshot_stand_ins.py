@@ -15,10 +15,10 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_mcbs import MCBSTD3
-from sb3_mcbs.models.base import ForwardModelError
 from sb3_mcbs.models.environments import LocalEnvironments
 from sb3_mcbs.models.factory import make_forward_model
 from sb3_mcbs.snapshot import SnapshotEnvWrapper, SnapshotMismatchError, SnapshotUnsupportedError
+from sb3_mcbs.types import ForwardModelError
 
 
 def doubled(step, action):

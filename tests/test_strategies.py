@@ -6,7 +6,7 @@ import pytest
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_mcbs import MCBSTD3, SearchPolicy, SearchSettings
-from sb3_mcbs.algorithms.searcher import Searcher
+from sb3_mcbs.agents.planner import Searcher
 from sb3_mcbs.search import Decision, PlanMemory, check_dynamics, search
 from sb3_mcbs.search.refine import draw_plan_noise, first_spread, refine_search
 from sb3_mcbs.search.tree import draw_tree_noise, tree_search

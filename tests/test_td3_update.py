@@ -9,7 +9,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_mcbs.algorithms.td3_update import TD3Update
+from sb3_mcbs.networks.td3_update import TD3Update
 
 
 def trained_pair(steps=200, env=None, cls=TD3, **kwargs):

@@ -15,7 +15,7 @@ from torch.nn.modules import module as torch_module
 from torch.nn.utils import parametrizations, prune
 from torch.optim import optimizer as torch_optimizer
 
-from sb3_mcbs.algorithms.td3_update import FastUpdate
+from sb3_mcbs.networks.td3_update import FastUpdate
 from tests.conftest import SMALL, assert_same_parameters
 
 

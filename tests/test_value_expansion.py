@@ -8,9 +8,9 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 
 from sb3_mcbs import MCBSDDPG, MCBSSAC, MCBSTD3, MCBSTQC
-from sb3_mcbs.algorithms.networks import entropy_function, policy_function, soft_policy_function
-from sb3_mcbs.algorithms.value_expansion import ValueExpansion
+from sb3_mcbs.agents.value_expansion import ValueExpansion
 from sb3_mcbs.models import ForwardModelError
+from sb3_mcbs.networks.functions import entropy_function, policy_function, soft_policy_function
 from tests.conftest import snapshot_vec_env
 
 AGENTS = [MCBSTD3, MCBSDDPG, MCBSSAC, MCBSTQC]

@@ -8,10 +8,10 @@ import gymnasium as gym
 import pytest
 import yaml
 
-from sb3_mcbs.algorithms.keywords import SETTINGS
+from sb3_mcbs.agents.hyperparameters import SETTINGS
+from sb3_mcbs.agents.registry import SEARCHING as ALGORITHMS
 from sb3_mcbs.search import SearchSettings
 from sb3_mcbs.zoo import hyperparams_path
-from sb3_mcbs.zoo.registration import ALGORITHMS
 
 SEARCH_KEYS = {*(name for settings in SETTINGS for name in settings.names()), "env_wrapper"}
 FAMILIES = [

@@ -18,8 +18,8 @@ import pytest
 
 import _sb3_mcbs_hook as hook
 from sb3_mcbs import MCBS
+from sb3_mcbs.agents.registry import SEARCHING as ALGORITHMS
 from sb3_mcbs.zoo import register, registration
-from sb3_mcbs.zoo.registration import ALGORITHMS
 from tests.conftest import SEARCHING
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -10,11 +10,11 @@ import yaml
 from stable_baselines3.common.logger import Logger
 
 from sb3_mcbs import MCBSTD3, SearchPolicy, SearchSettings, SnapshotEnvWrapper
-from sb3_mcbs.algorithms.keywords import SETTINGS
+from sb3_mcbs.agents.hyperparameters import SETTINGS
+from sb3_mcbs.agents.registry import SEARCHING as ALGORITHMS
 from sb3_mcbs.zoo.callbacks import RenamingLogger, SearchEvalCallback, SecondEvalCallback
 from sb3_mcbs.zoo.manager import NAMES
 from sb3_mcbs.zoo.paths import sibling_folder
-from sb3_mcbs.zoo.registration import ALGORITHMS
 from sb3_mcbs.zoo.repeat import load_run
 from tests.zoo_helpers import TINY, TINY_SEARCH, evaluations, monitor_rewards, zoo_train
 

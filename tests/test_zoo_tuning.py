@@ -11,11 +11,11 @@ import pytest
 import yaml
 
 from sb3_mcbs import SearchPolicy
-from sb3_mcbs.algorithms.keywords import SETTINGS
+from sb3_mcbs.agents.hyperparameters import SETTINGS
+from sb3_mcbs.agents.registry import SEARCHING as ALGORITHMS
 from sb3_mcbs.search import SearchSettings, with_preset
 from sb3_mcbs.zoo import sampler, train
 from sb3_mcbs.zoo.paths import hyperparams_path
-from sb3_mcbs.zoo.registration import ALGORITHMS
 from tests.zoo_helpers import TINY, zoo_train
 
 SEARCH = {"beam_width": 6, "rollout_depth": 3, "n_simulations": 5, "beam_noise": 0.1}

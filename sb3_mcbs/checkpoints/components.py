@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvWrapper
 from torch import nn
 
-from sb3_mcbs.algorithms import SearchPolicy
+from sb3_mcbs.agents import SearchPolicy
 from sb3_mcbs.checkpoints.buffers import row_attributes
 
 _HOOKS = "functions that somebody attached to the network"

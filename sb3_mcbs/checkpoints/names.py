@@ -17,7 +17,7 @@ from stable_baselines3.her.goal_selection_strategy import GoalSelectionStrategy
 from stable_baselines3.sac import policies as sac_policies
 from stable_baselines3.td3 import policies as td3_policies
 
-from sb3_mcbs.algorithms.load_agent import ALGORITHMS
+from sb3_mcbs.agents.registry import ALGORITHMS
 from sb3_mcbs.checkpoints.encoding import name_of
 from sb3_mcbs.snapshot.functions import FunctionName
 

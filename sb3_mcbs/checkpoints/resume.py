@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 
+from sb3_mcbs.agents.mcbs import MCBS
 from sb3_mcbs.checkpoints.errors import CheckpointError
 from sb3_mcbs.checkpoints.files import check_below
 from sb3_mcbs.checkpoints.names import known_names
@@ -83,6 +84,9 @@ def resume_as(cls: type[_Agent], path: str | os.PathLike[str], env: GymEnv | Non
             f"The run in {path} is of a {type(agent).__name__}, not of a {cls.__name__}. Use sb3_mcbs.resume."
         )
     return agent
+
+
+MCBS._resume_as = resume_as
 
 
 def read_resumption(path: str | os.PathLike[str], classes: Iterable[Any] = ()) -> Resumption:

@@ -22,7 +22,7 @@ from stable_baselines3.common.vec_env import (
     VecTransposeImage,
 )
 
-from sb3_mcbs.algorithms.vec_env_view import snapshot_environments
+from sb3_mcbs.agents.observation_pipeline import snapshot_environments
 from sb3_mcbs.checkpoints.components import layers_of
 from sb3_mcbs.checkpoints.encoding import Decoder, Encoded, Encoder, name_of
 from sb3_mcbs.checkpoints.environments import describe_environment, make_environment

@@ -10,9 +10,9 @@ from stable_baselines3.common.logger import KVWriter
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecMonitor
 
-from sb3_mcbs.algorithms import SearchPolicy
-from sb3_mcbs.algorithms.attributes import SearchAttributes
-from sb3_mcbs.algorithms.vec_env_view import snapshot_environments
+from sb3_mcbs.agents import SearchPolicy
+from sb3_mcbs.agents.attributes import SearchAttributes
+from sb3_mcbs.agents.observation_pipeline import snapshot_environments
 from sb3_mcbs.checkpoints.components import components, layers_of, not_state_of
 from sb3_mcbs.checkpoints.encoding import Decoder, Encoded, Encoder, in_section, of_section
 from sb3_mcbs.checkpoints.environments import (

@@ -2,7 +2,6 @@
 
 from sb3_mcbs.models import gymnasium_families as _families
 from sb3_mcbs.models import gymnasium_small_families as _small_families
-from sb3_mcbs.models.base import ForwardModel, ForwardModelError, Observations, Transition
 from sb3_mcbs.models.ensemble import Ensemble, Prediction, Transitions
 from sb3_mcbs.models.ensemble_model import EnsembleModel
 from sb3_mcbs.models.environments import Environments, LocalEnvironments, WorkerEnvironments
@@ -11,6 +10,7 @@ from sb3_mcbs.models.families import Constants, Family, Fields, Outcome, Rows, r
 from sb3_mcbs.models.mujoco_batch import MujocoBatchModel
 from sb3_mcbs.models.pool import EnvPoolModel
 from sb3_mcbs.models.workers import WorkerError
+from sb3_mcbs.types import ForwardModel, ForwardModelError, Observations, Transition
 
 del _families, _small_families
 

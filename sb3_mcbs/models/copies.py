@@ -12,7 +12,6 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_mcbs.models.base import ForwardModelError, Observations
 from sb3_mcbs.models.probing import Randomness, probe_randomness
 from sb3_mcbs.snapshot import (
     SIMULATION_DIVERGED,
@@ -21,13 +20,7 @@ from sb3_mcbs.snapshot import (
     SnapshotMismatchError,
 )
 from sb3_mcbs.snapshot.global_generators import isolated_globals
-
-
-def stack(observations: list[Any]) -> Observations:
-    """``[rows, *obs_shape]`` from single observations, per key where they are dicts."""
-    if isinstance(observations[0], dict):
-        return {key: np.stack([one[key] for one in observations]) for key in observations[0]}
-    return np.stack(observations)
+from sb3_mcbs.types import ForwardModelError
 
 
 def _copied(observation: Any) -> Any:

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from sb3_mcbs.models.base import ForwardModel, ForwardModelError, Transition
 from sb3_mcbs.models.ensemble import Ensemble
+from sb3_mcbs.types import ForwardModel, ForwardModelError, Transition
 
 
 class EnsembleModel(ForwardModel):

@@ -11,9 +11,9 @@ from weakref import WeakKeyDictionary, finalize, ref
 import cloudpickle
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
-from sb3_mcbs.models.base import ForwardModelError
 from sb3_mcbs.models.workers import await_answers, collect_tracebacks, worker_error
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
+from sb3_mcbs.types import ForwardModelError
 
 _Call = tuple[Callable[..., Any], tuple[Any, ...]]
 

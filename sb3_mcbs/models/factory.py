@@ -2,14 +2,12 @@
 
 import logging
 
-from sb3_mcbs.models.base import ForwardModelError
 from sb3_mcbs.models.environments import Environments
 from sb3_mcbs.models.mujoco_batch import MujocoBatchModel, NotRecognizedError
 from sb3_mcbs.models.pool import EnvPoolModel
+from sb3_mcbs.types import BACKENDS, ForwardModelError
 
 logger = logging.getLogger("sb3_mcbs")
-
-KINDS = ("auto", "mujoco", "pool", "ensemble")
 
 
 def make_forward_model(
@@ -26,8 +24,8 @@ def make_forward_model(
     :raises ForwardModelError: with "mujoco", if it cannot simulate these environments.
     :raises ValueError: for another kind, ``"ensemble"`` among them.
     """
-    if kind not in KINDS:
-        raise ValueError(f"unknown forward model {kind!r}; choose one of {', '.join(map(repr, KINDS))}")
+    if kind not in BACKENDS:
+        raise ValueError(f"unknown forward model {kind!r}; choose one of {', '.join(map(repr, BACKENDS))}")
     level, reason = logging.INFO, ""
     if kind == "ensemble":
         raise ValueError(

@@ -8,7 +8,6 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from sb3_mcbs.models.base import ForwardModel, ForwardModelError, Transition
 from sb3_mcbs.models.engines import INTEGRATION, Engine, available_cpus, is_state_field, make_engine
 from sb3_mcbs.models.environments import Environments
 from sb3_mcbs.models.families import Rows, family_of
@@ -24,6 +23,7 @@ from sb3_mcbs.models.recognition import (
     sample_transitions,
 )
 from sb3_mcbs.models.workers import WorkerError
+from sb3_mcbs.types import ForwardModel, ForwardModelError, Transition
 
 _FIRST_CAPACITY = 32
 

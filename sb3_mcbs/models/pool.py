@@ -10,18 +10,10 @@ from weakref import finalize
 
 import numpy as np
 
-from sb3_mcbs.models.base import ForwardModel, ForwardModelError, Transition
-from sb3_mcbs.models.copies import (
-    drop_copies,
-    keep_root,
-    open_copies,
-    select_rows,
-    set_rows,
-    stack,
-    step_rows,
-)
+from sb3_mcbs.models.copies import drop_copies, keep_root, open_copies, select_rows, set_rows, step_rows
 from sb3_mcbs.models.environments import Environments
 from sb3_mcbs.models.workers import WorkerError
+from sb3_mcbs.types import ForwardModel, ForwardModelError, Transition, stack
 
 logger = logging.getLogger("sb3_mcbs")
 

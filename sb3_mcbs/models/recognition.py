@@ -11,13 +11,13 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 
-from sb3_mcbs.models.base import ForwardModelError
 from sb3_mcbs.models.engines import INTEGRATION
 from sb3_mcbs.models.families import Constants, Fields, family_of, known_families
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 from sb3_mcbs.snapshot.layers import replaced_method
 from sb3_mcbs.snapshot.spaces import random_action
 from sb3_mcbs.snapshot.stand_ins import StandIn
+from sb3_mcbs.types import ForwardModelError
 
 #: Wrappers that change neither observation nor reward nor action, by their full names: RL Zoo
 #: exchanges Gymnasium's TimeLimit for its own when it is imported, before or after ours.

@@ -6,7 +6,6 @@ from sb3_mcbs.search.directions import RecentActions
 from sb3_mcbs.search.interface import Agent, FirstStep, Rollouts, SearchResult
 from sb3_mcbs.search.memory import Moment, PlanMemory
 from sb3_mcbs.search.proposals import Noise, draw_noise
-from sb3_mcbs.search.schedule import ScheduleSettings, SearchSchedule
 from sb3_mcbs.search.settings import PRESETS, SearchSettings, with_preset
 from sb3_mcbs.search.strategies import Decision, check_dynamics, search
 
@@ -21,9 +20,7 @@ __all__ = [
     "PlanMemory",
     "RecentActions",
     "Rollouts",
-    "ScheduleSettings",
     "SearchResult",
-    "SearchSchedule",
     "SearchSettings",
     "beam_search",
     "check_dynamics",

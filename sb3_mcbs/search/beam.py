@@ -9,17 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_mcbs.models.base import ForwardModel, Observations, Transition
-from sb3_mcbs.search.interface import (
-    Agent,
-    FirstStep,
-    Rollouts,
-    SearchResult,
-    map_arrays,
-    put_rows,
-    stopped_values,
-    take_rows,
-)
+from sb3_mcbs.search.interface import Agent, FirstStep, Rollouts, SearchResult, stopped_values
 from sb3_mcbs.search.proposals import (
     Noise,
     clip_actions,
@@ -29,6 +19,7 @@ from sb3_mcbs.search.proposals import (
     without_first,
 )
 from sb3_mcbs.search.settings import SearchSettings
+from sb3_mcbs.types import ForwardModel, Observations, Transition, map_arrays, put_rows, take_rows
 
 _ALL = slice(None)
 

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from sb3_mcbs.models.base import ForwardModel, Observations
 from sb3_mcbs.search.beam import OutOfTimeError, choose, join_rounds, rollout_values
 from sb3_mcbs.search.interface import Agent, CountedValue, FirstStep, SearchResult
 from sb3_mcbs.search.proposals import draw_noise, propose, without_first
 from sb3_mcbs.search.settings import SearchSettings
+from sb3_mcbs.types import ForwardModel, Observations
 
 #: How many past durations a forecast looks at, and which share of them it covers: of rounds, and of single
 #: steps, which are what makes a decision late.

@@ -5,11 +5,11 @@ Axes: ``n_envs`` environments, ``beam`` candidates, ``sim`` simulations, ``act_d
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from sb3_mcbs.models.base import Observations, Transition
+from sb3_mcbs.types import Observations, Transition, take_rows
 
 
 class Agent(NamedTuple):
@@ -130,44 +130,3 @@ def stopped_values(step: Transition, agent: Agent) -> tuple[np.ndarray, np.ndarr
     if agent.entropy_bonus is not None:
         values += agent.entropy_bonus(observations, actions).astype(np.float64)
     return rows, values
-
-
-def map_arrays(function: Callable[[np.ndarray], Any], observations: Observations) -> Any:
-    """Apply a function to observations, or to each part of a dict of them.
-
-    :param function: of one array.
-    :param observations: one array, or one per key.
-    :return: its value, or one per key.
-    """
-    if isinstance(observations, dict):
-        return {key: function(value) for key, value in observations.items()}
-    return function(observations)
-
-
-def take_rows(observations: Observations, index: np.ndarray | slice) -> Observations:
-    """Copy rows out of observations.
-
-    :param observations: ``[rows, *obs_shape]``.
-    :param index: which rows.
-    :return: the copy.
-    """
-    if isinstance(observations, dict):
-        return {key: value[index].copy() for key, value in observations.items()}
-    return observations[index].copy()
-
-
-def put_rows(target: Observations, into: Any, source: Observations, index: Any) -> None:
-    """Copy rows into other observations.
-
-    :param target: ``[n, *obs_shape]``, changed in place.
-    :param into: which of its rows, or other places.
-    :param source: ``[rows, *obs_shape]``.
-    :param index: which of its rows, or other places, as many.
-    """
-    if isinstance(target, dict):
-        assert isinstance(source, dict)
-        for key, value in target.items():
-            value[into] = source[key][index]
-    else:
-        assert isinstance(source, np.ndarray)
-        target[into] = source[index]

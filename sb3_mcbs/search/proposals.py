@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_mcbs.models.base import Observations
 from sb3_mcbs.search.directions import low_dimensional
-from sb3_mcbs.search.interface import Agent, take_rows
+from sb3_mcbs.search.interface import Agent
 from sb3_mcbs.search.settings import SearchSettings
+from sb3_mcbs.types import Observations, take_rows
 
 
 class Noise(NamedTuple):

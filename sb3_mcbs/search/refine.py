@@ -11,12 +11,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_mcbs.models.base import ForwardModel, Observations
 from sb3_mcbs.search.beam import choose, join_rounds, mean_values, rollout_values
 from sb3_mcbs.search.directions import combine, gain
 from sb3_mcbs.search.interface import Agent, FirstStep, SearchResult
 from sb3_mcbs.search.proposals import Noise, best, critic_values, draw_normal, preselect, propose, scale
 from sb3_mcbs.search.settings import SearchSettings
+from sb3_mcbs.types import ForwardModel, Observations
 
 
 class Plans(NamedTuple):

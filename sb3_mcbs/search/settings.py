@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from sb3_mcbs.models.factory import KINDS
 from sb3_mcbs.search.checks import CheckedSettings
+from sb3_mcbs.types import BACKENDS
 
 #: More rollouts than this per environment are a mistake, not a search: memory would run out.
 MAX_ROLLOUTS = 100_000
@@ -126,7 +126,7 @@ class SearchSettings(CheckedSettings):
         flags = ("include_policy_action", "common_noise", "antithetic", "one_node_per_root", "entropy_bonus")
         for name in flags:
             self._check_flag(name)
-        self._check_name("forward_model", KINDS)
+        self._check_name("forward_model", BACKENDS)
         self._check_name("strategy", STRATEGIES)
         self._check_name("tqc_value", TQC_VALUES)
         if self.matmul_precision is not None:

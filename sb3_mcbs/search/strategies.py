@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_mcbs.models.base import ForwardModel, Observations
 from sb3_mcbs.search.beam import beam_search
 from sb3_mcbs.search.interface import Agent, CountedValue, SearchResult
 from sb3_mcbs.search.memory import Moment, PlanMemory
@@ -14,6 +13,7 @@ from sb3_mcbs.search.proposals import draw_noise
 from sb3_mcbs.search.refine import draw_plan_noise, refine_search
 from sb3_mcbs.search.settings import SearchSettings
 from sb3_mcbs.search.tree import draw_tree_noise, tree_search
+from sb3_mcbs.types import ForwardModel, Observations
 
 logger = logging.getLogger("sb3_mcbs")
 

@@ -10,10 +10,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_mcbs.models.base import ForwardModel, Observations
 from sb3_mcbs.search.beam import choose
 from sb3_mcbs.search.directions import low_dimensional
-from sb3_mcbs.search.interface import Agent, FirstStep, SearchResult, stopped_values, take_rows
+from sb3_mcbs.search.interface import Agent, FirstStep, SearchResult, stopped_values
 from sb3_mcbs.search.proposals import (
     best,
     clip_actions,
@@ -25,6 +24,7 @@ from sb3_mcbs.search.proposals import (
     without_first,
 )
 from sb3_mcbs.search.settings import SearchSettings
+from sb3_mcbs.types import ForwardModel, Observations, take_rows
 
 
 class TreeNoise(NamedTuple):

@@ -9,7 +9,7 @@ from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_mcbs.algorithms import MCBS, SearchPolicy
+from sb3_mcbs.agents import MCBS, SearchPolicy
 
 
 class ActsWithSearch(EvalCallback):

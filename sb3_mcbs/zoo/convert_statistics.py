@@ -5,7 +5,7 @@ import pickle
 import sys
 from pathlib import Path
 
-from sb3_mcbs.algorithms.normalization import save_statistics
+from sb3_mcbs.loading.normalization import save_statistics
 
 
 def convert_statistics(pickle_path: str | Path, npz_path: str | Path, trusted: bool = False) -> None:
@@ -13,7 +13,7 @@ def convert_statistics(pickle_path: str | Path, npz_path: str | Path, trusted: b
     Write the statistics of a pickled ``VecNormalize`` as npz.
 
     :param pickle_path: what ``VecNormalize.save`` or RL Zoo wrote, usually ``vecnormalize.pkl``
-    :param npz_path: the file to write, for ``sb3_mcbs.algorithms.normalization.load_statistics``
+    :param npz_path: the file to write, for ``sb3_mcbs.loading.normalization.load_statistics``
     :param trusted: that the caller trusts the pickle's author
     :raises PermissionError: without ``trusted``
     :raises ValueError: if the file is no pickle, or its code fails

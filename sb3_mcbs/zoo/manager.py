@@ -13,19 +13,19 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_mcbs.algorithms.keywords import SETTING_NAMES, settings_of_preset
+from sb3_mcbs.agents.hyperparameters import SETTING_NAMES, settings_of_preset
+from sb3_mcbs.agents.registry import SEARCHING
+from sb3_mcbs.agents.schedule import SCHEDULES, UNITS
 from sb3_mcbs.checkpoints import CheckpointError, ExactCheckpointCallback
 from sb3_mcbs.checkpoints.resume import continue_with
 from sb3_mcbs.checkpoints.resumption import Resumption
 from sb3_mcbs.models import ForwardModelError
-from sb3_mcbs.models.factory import KINDS
 from sb3_mcbs.search import PRESETS, SearchSettings, with_preset
-from sb3_mcbs.search.schedule import SCHEDULES, UNITS
 from sb3_mcbs.search.settings import MATMUL_PRECISIONS, STRATEGIES, TQC_VALUES
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
+from sb3_mcbs.types import BACKENDS
 from sb3_mcbs.zoo.callbacks import SearchEvalCallback, SecondEvalCallback
 from sb3_mcbs.zoo.paths import PathError, hyperparams_path, sibling_folder
-from sb3_mcbs.zoo.registration import ALGORITHMS
 from sb3_mcbs.zoo.sampler import HELD
 
 #: ``-conf sb3_mcbs`` names this package's file for the algorithm of the command line.
@@ -39,7 +39,7 @@ NAMES = {
     "preset": tuple(PRESETS),
     "strategy": STRATEGIES,
     "tqc_value": TQC_VALUES,
-    "forward_model": KINDS,
+    "forward_model": BACKENDS,
     "matmul_precision": MATMUL_PRECISIONS,
     "search_schedule": SCHEDULES,
     "search_unit": UNITS,
@@ -83,7 +83,7 @@ class MCBSExperimentManager(ExperimentManager):
         super().__init__(*args, **kwargs)
         self.search_evaluation: dict[str, Any] | None = None
         config = arguments.get("config")
-        if config == PACKAGE_CONFIG or (config is None and self.algo in ALGORITHMS):
+        if config == PACKAGE_CONFIG or (config is None and self.algo in SEARCHING):
             try:
                 self.config = str(hyperparams_path(self.algo))
             except PathError as error:
@@ -116,14 +116,14 @@ class MCBSExperimentManager(ExperimentManager):
         :return: the hyperparameters, and the same in order, to be saved
         """
         first_trial = self.trial_id == 0 and self.storage and self.study_name
-        if first_trial and self.algo in ALGORITHMS and not self.optimize_hyperparameters:
+        if first_trial and self.algo in SEARCHING and not self.optimize_hyperparameters:
             print("Loading from Optuna study...")
             trial = self.load_trial(str(self.storage), str(self.study_name), 0)
             self.custom_hyperparams = {**trial, **(self.custom_hyperparams or {})}
         custom = self.custom_hyperparams or {}
-        if self.algo in ALGORITHMS:
+        if self.algo in SEARCHING:
             _check_names(custom)
-        if self.algo in ALGORITHMS and custom.get("preset") is not None:
+        if self.algo in SEARCHING and custom.get("preset") is not None:
             if self.optimize_hyperparameters:
                 raise ValueError(
                     "Trials draw the search's settings and know no preset: leave preset out of -params."
@@ -150,7 +150,7 @@ class MCBSExperimentManager(ExperimentManager):
         :return: the return that is maximised
         :raises optuna.TrialPruned: also where RL Zoo prunes
         """
-        if self.algo in ALGORITHMS:
+        if self.algo in SEARCHING:
             names = {"optimize_memory_usage", *SETTING_NAMES}
             held = {name: value for name, value in self._hyperparams.items() if name in names}
             trial.set_user_attr(HELD, held)
@@ -172,9 +172,9 @@ class MCBSExperimentManager(ExperimentManager):
                 callback.path = Path(self.save_path) / CHECKPOINTS
         super().create_callbacks()
         index = next((i for i, cb in enumerate(self.callbacks) if isinstance(cb, SearchEvalCallback)), None)
-        if index is None or (self.algo not in ALGORITHMS and self.search_evaluation is None):
+        if index is None or (self.algo not in SEARCHING and self.search_evaluation is None):
             return
-        label = "actor" if self.algo in ALGORITHMS else "search"
+        label = "actor" if self.algo in SEARCHING else "search"
         if self.verbose > 0:
             print("Creating second test environment")
         second = SecondEvalCallback(
@@ -216,7 +216,7 @@ def _checked_search_evaluation(settings: Any, algo: str) -> dict[str, Any]:
     if algo not in SEARCHABLE:
         reason = (
             "is evaluated with its training's search settings already"
-            if algo in ALGORITHMS
+            if algo in SEARCHING
             else "has no policy and critics to search with"
         )
         raise ValueError(

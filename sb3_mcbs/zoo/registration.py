@@ -17,13 +17,10 @@ import gymnasium as gym
 from stable_baselines3.common import env_util
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_mcbs.algorithms.keywords import SETTING_NAMES
-from sb3_mcbs.algorithms.load_agent import ALGORITHMS as KNOWN_ALGORITHMS
-from sb3_mcbs.algorithms.mcbs import MCBS
+from sb3_mcbs.agents.hyperparameters import SETTING_NAMES
+from sb3_mcbs.agents.registry import SEARCHING
 from sb3_mcbs.zoo.sampler import convert_mcbs_params, sample_mcbs_params
 
-#: Our algorithms under their names on RL Zoo's command line.
-ALGORITHMS = {name: cls for name, cls in KNOWN_ALGORITHMS.items() if issubclass(cls, MCBS)}
 #: By these names, and others beside them, RL Zoo's commands know the algorithms that have a replay buffer.
 OFF_POLICY = frozenset(("ddpg", "sac", "td3", "tqc"))
 #: Hyperparameters whose values may be names, which need no quotes on the command line.
@@ -60,7 +57,7 @@ def after_import(module: ModuleType) -> None:
 
 
 def _add_algorithms(utils: Any) -> None:
-    utils.ALGOS.update(ALGORITHMS)
+    utils.ALGOS.update(SEARCHING)
     utils.make_vec_env = make_vec_env
     _accept_names(utils)
 
@@ -139,7 +136,7 @@ def _without_deprecation(make: Callable[..., gym.Env]) -> Callable[..., gym.Env]
 
 
 def _add_samplers(hyperparams_opt: Any) -> None:
-    for name in ALGORITHMS:
+    for name in SEARCHING:
         base = name.removeprefix("mcbs_")
         hyperparams_opt.HYPERPARAMS_SAMPLER[name] = partial(sample_mcbs_params, base)
         hyperparams_opt.HYPERPARAMS_CONVERTER[name] = convert_mcbs_params
@@ -177,7 +174,7 @@ def with_our_off_policy_names(code: CodeType) -> CodeType:
         if isinstance(constant, CodeType):
             constant = with_our_off_policy_names(constant)
         elif isinstance(constant, tuple) and OFF_POLICY.issubset(constant):
-            constant = (*constant, *(name for name in ALGORITHMS if name not in constant))
+            constant = (*constant, *(name for name in SEARCHING if name not in constant))
         constants.append(constant)
     return code.replace(co_consts=tuple(constants))
 

@@ -14,12 +14,12 @@ from typing import Any
 
 import optuna
 
-from sb3_mcbs.algorithms.keywords import SETTING_NAMES
-from sb3_mcbs.algorithms.rollout_replay import RolloutReplaySettings
-from sb3_mcbs.algorithms.value_expansion import ValueExpansionSettings
-from sb3_mcbs.search import ScheduleSettings, SearchSettings
+from sb3_mcbs.agents.hyperparameters import SETTING_NAMES
+from sb3_mcbs.agents.rollout_replay import RolloutReplaySettings
+from sb3_mcbs.agents.schedule import SCHEDULES, UNITS, ScheduleSettings
+from sb3_mcbs.agents.value_expansion import ValueExpansionSettings
+from sb3_mcbs.search import SearchSettings
 from sb3_mcbs.search.checks import CheckedSettings
-from sb3_mcbs.search.schedule import SCHEDULES, UNITS
 from sb3_mcbs.search.settings import OF_THE_MACHINE, TQC_VALUES
 
 SWITCH = "SB3_MCBS_TUNE"

@@ -1,0 +1,11 @@
+"""Agents of Stable-Baselines3 that search before they act, and acting with search with any of its agents."""
+
+from sb3_mcbs.agents.mcbs import MCBS
+from sb3_mcbs.agents.mcbs_ddpg import MCBSDDPG
+from sb3_mcbs.agents.mcbs_sac import MCBSSAC
+from sb3_mcbs.agents.mcbs_td3 import MCBSTD3
+from sb3_mcbs.agents.mcbs_tqc import MCBSTQC
+from sb3_mcbs.agents.schedule import ScheduleSettings
+from sb3_mcbs.agents.search_policy import SearchPolicy
+
+__all__ = ["MCBS", "MCBSDDPG", "MCBSSAC", "MCBSTD3", "MCBSTQC", "ScheduleSettings", "SearchPolicy"]

@@ -1,0 +1,121 @@
+"""DDPG that looks ahead before it acts."""
+
+from typing import Any, Unpack
+
+import torch as th
+from stable_baselines3 import DDPG
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.td3.policies import TD3Policy
+
+from sb3_mcbs.agents.hyperparameters import SearchKeywords
+from sb3_mcbs.agents.mcbs import MCBS
+from sb3_mcbs.networks.td3_update import FastUpdate
+
+
+class MCBSDDPG(MCBS, FastUpdate, DDPG):
+    """
+    Monte Carlo Beam Search for DDPG (MCBS-DDPG).
+
+    As :class:`~sb3_mcbs.MCBSTD3`, with the losses of DDPG: ``matmul_precision`` holds for them too.
+    Rollouts end with the value of the one critic, or with the minimum where ``policy_kwargs`` asks for more.
+
+    ``predict`` is the actor alone, without search, as for every SB3 algorithm: it needs no environment.
+    To act with search use :class:`~sb3_mcbs.SearchPolicy`.
+
+    What is simulated needs environments in :class:`~sb3_mcbs.SnapshotEnvWrapper`: the algorithm wraps them
+    itself, except in a ``SubprocVecEnv``, where they must be wrapped when they are made.
+
+    :param policy: The policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy)
+    :param env: The environment to learn from (if registered in Gymnasium, can be str)
+    :param learning_rate: learning rate for the Adam optimizers, a constant or a function of the remaining
+        progress (from 1 to 0)
+    :param buffer_size: size of the replay buffer
+    :param learning_starts: how many steps of the model to collect transitions for before learning, and
+        searching, starts
+    :param batch_size: Minibatch size for each gradient update
+    :param tau: the soft update coefficient ("Polyak update", between 0 and 1)
+    :param gamma: the discount factor, of the critics and of the rollouts
+    :param train_freq: Update the model every ``train_freq`` steps, or a tuple like ``(5, "step")`` or
+        ``(2, "episode")``
+    :param gradient_steps: How many gradient steps to do after each rollout; -1 means as many as steps done
+    :param action_noise: noise on actions chosen without search (before ``learning_starts`` and where
+        the schedule leaves the search out). Searched actions are executed as they are unless
+        ``action_noise_after_search`` is set.
+    :param replay_buffer_class: Replay buffer class to use (for instance ``HerReplayBuffer``)
+    :param replay_buffer_kwargs: Keyword arguments to pass to the replay buffer on creation
+    :param optimize_memory_usage: Enable a memory efficient variant of the replay buffer
+    :param n_steps: number of steps of n-step returns in the critic's target
+    :param tensorboard_log: the log location for tensorboard (if None, no logging)
+    :param policy_kwargs: additional arguments to be passed to the policy on creation
+    :param verbose: Verbosity level: 0 for no output, 1 for info messages, 2 for debug messages
+    :param seed: Seed for the pseudo random generators, the search's own included
+    :param device: Device (cpu, cuda, ...) on which the networks run; simulation is on the CPU
+    :param _init_setup_model: Whether or not to build the network at the creation of the instance
+    :param action_noise_after_search: add ``action_noise`` to searched actions too
+    :param fast_update: do gradient steps with SB3's mathematics but fewer instructions, where the networks
+        are plain MLPs; others use SB3's own
+    :param preset: a name of :data:`~sb3_mcbs.search.PRESETS`: where the search's settings start from. Those
+        that are given hold in any case.
+    :param search_settings: the fields of :class:`~sb3_mcbs.SearchSettings` and
+        :class:`~sb3_mcbs.search.ScheduleSettings`
+    """
+
+    def __init__(
+        self,
+        policy: str | type[TD3Policy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 1e-3,
+        buffer_size: int = 1_000_000,
+        learning_starts: int = 100,
+        batch_size: int = 256,
+        tau: float = 0.005,
+        gamma: float = 0.99,
+        train_freq: int | tuple[int, str] = 1,
+        gradient_steps: int = 1,
+        action_noise: ActionNoise | None = None,
+        replay_buffer_class: type[ReplayBuffer] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        optimize_memory_usage: bool = False,
+        n_steps: int = 1,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+        *,
+        action_noise_after_search: bool = False,
+        fast_update: bool = True,
+        preset: str | None = None,
+        **search_settings: Unpack[SearchKeywords],
+    ) -> None:
+        super().__init__(
+            policy,
+            env,
+            learning_rate,
+            buffer_size,
+            learning_starts,
+            batch_size,
+            tau,
+            gamma,
+            train_freq,
+            gradient_steps,
+            action_noise=action_noise,
+            replay_buffer_class=replay_buffer_class,
+            replay_buffer_kwargs=replay_buffer_kwargs,
+            optimize_memory_usage=optimize_memory_usage,
+            n_steps=n_steps,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs=policy_kwargs,
+            verbose=verbose,
+            seed=seed,
+            device=device,
+            _init_setup_model=False,
+        )
+        self._init_search(action_noise_after_search, search_settings, preset)
+        self.fast_update = fast_update
+
+        if _init_setup_model:
+            self._setup_model()

@@ -1,0 +1,142 @@
+"""SAC that looks ahead before it acts."""
+
+from typing import Any, Unpack
+
+import torch as th
+from stable_baselines3 import SAC
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.sac.policies import SACPolicy
+
+from sb3_mcbs.agents.hyperparameters import SearchKeywords
+from sb3_mcbs.agents.mcbs import MCBS
+
+
+class MCBSSAC(MCBS, SAC):
+    """
+    Monte Carlo Beam Search for SAC (MCBS-SAC).
+
+    As :class:`~sb3_mcbs.MCBSTD3`, with the losses of SAC: ``matmul_precision`` holds for them too.
+    Searched actions lie around the actor's mean action, not around one that the actor (or gSDE) drew, and
+    rollouts end with the minimum of the critics' values, without an entropy term unless ``entropy_bonus`` is
+    set. Before ``learning_starts`` the agent acts as SAC does.
+
+    ``predict`` is the actor alone, without search, as for every SB3 algorithm: it needs no environment.
+    To act with search use :class:`~sb3_mcbs.SearchPolicy`.
+
+    What is simulated needs environments in :class:`~sb3_mcbs.SnapshotEnvWrapper`: the algorithm wraps them
+    itself, except in a ``SubprocVecEnv``, where they must be wrapped when they are made.
+
+    :param policy: The policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy)
+    :param env: The environment to learn from (if registered in Gymnasium, can be str)
+    :param learning_rate: learning rate for the Adam optimizers, a constant or a function of the remaining
+        progress (from 1 to 0)
+    :param buffer_size: size of the replay buffer
+    :param learning_starts: how many steps of the model to collect transitions for before learning, and
+        searching, starts
+    :param batch_size: Minibatch size for each gradient update
+    :param tau: the soft update coefficient ("Polyak update", between 0 and 1)
+    :param gamma: the discount factor, of the critics and of the rollouts
+    :param train_freq: Update the model every ``train_freq`` steps, or a tuple like ``(5, "step")`` or
+        ``(2, "episode")``
+    :param gradient_steps: How many gradient steps to do after each rollout; -1 means as many as steps done
+    :param action_noise: noise on actions chosen without search (before ``learning_starts`` and where
+        the schedule leaves the search out). Searched actions are executed as they are unless
+        ``action_noise_after_search`` is set.
+    :param replay_buffer_class: Replay buffer class to use (for instance ``HerReplayBuffer``)
+    :param replay_buffer_kwargs: Keyword arguments to pass to the replay buffer on creation
+    :param optimize_memory_usage: Enable a memory efficient variant of the replay buffer
+    :param n_steps: number of steps of n-step returns in the critic's target
+    :param ent_coef: Entropy regularization coefficient of the losses; ``"auto"`` learns it (``"auto_0.1"``
+        from 0.1 on)
+    :param target_update_interval: update the target network every ``target_update_interval`` gradient steps
+    :param target_entropy: target entropy when learning ``ent_coef``
+    :param use_sde: Whether to use generalized State Dependent Exploration (gSDE), for actions chosen without
+        search and for the losses
+    :param sde_sample_freq: Sample a new noise matrix every n steps when using gSDE; -1: only at the beginning
+        of the rollout
+    :param use_sde_at_warmup: Whether to use gSDE instead of uniform sampling before ``learning_starts``
+    :param stats_window_size: Window size for the rollout logging, in episodes
+    :param tensorboard_log: the log location for tensorboard (if None, no logging)
+    :param policy_kwargs: additional arguments to be passed to the policy on creation
+    :param verbose: Verbosity level: 0 for no output, 1 for info messages, 2 for debug messages
+    :param seed: Seed for the pseudo random generators, the search's own included
+    :param device: Device (cpu, cuda, ...) on which the networks run; simulation is on the CPU
+    :param _init_setup_model: Whether or not to build the network at the creation of the instance
+    :param action_noise_after_search: add ``action_noise`` to searched actions too
+    :param preset: a name of :data:`~sb3_mcbs.search.PRESETS`: where the search's settings start from. Those
+        that are given hold in any case.
+    :param search_settings: the fields of :class:`~sb3_mcbs.SearchSettings` and
+        :class:`~sb3_mcbs.search.ScheduleSettings`
+    """
+
+    def __init__(
+        self,
+        policy: str | type[SACPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 3e-4,
+        buffer_size: int = 1_000_000,
+        learning_starts: int = 100,
+        batch_size: int = 256,
+        tau: float = 0.005,
+        gamma: float = 0.99,
+        train_freq: int | tuple[int, str] = 1,
+        gradient_steps: int = 1,
+        action_noise: ActionNoise | None = None,
+        replay_buffer_class: type[ReplayBuffer] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        optimize_memory_usage: bool = False,
+        n_steps: int = 1,
+        ent_coef: str | float = "auto",
+        target_update_interval: int = 1,
+        target_entropy: str | float = "auto",
+        use_sde: bool = False,
+        sde_sample_freq: int = -1,
+        use_sde_at_warmup: bool = False,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+        *,
+        action_noise_after_search: bool = False,
+        preset: str | None = None,
+        **search_settings: Unpack[SearchKeywords],
+    ) -> None:
+        super().__init__(
+            policy,
+            env,
+            learning_rate,
+            buffer_size,
+            learning_starts,
+            batch_size,
+            tau,
+            gamma,
+            train_freq,
+            gradient_steps,
+            action_noise=action_noise,
+            replay_buffer_class=replay_buffer_class,
+            replay_buffer_kwargs=replay_buffer_kwargs,
+            optimize_memory_usage=optimize_memory_usage,
+            n_steps=n_steps,
+            ent_coef=ent_coef,
+            target_update_interval=target_update_interval,
+            target_entropy=target_entropy,
+            use_sde=use_sde,
+            sde_sample_freq=sde_sample_freq,
+            use_sde_at_warmup=use_sde_at_warmup,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs=policy_kwargs,
+            verbose=verbose,
+            seed=seed,
+            device=device,
+            _init_setup_model=False,
+        )
+        self._init_search(action_noise_after_search, search_settings, preset)
+
+        if _init_setup_model:
+            self._setup_model()

@@ -1,0 +1,215 @@
+"""Act with search with any trained agent."""
+
+import operator
+from copy import deepcopy
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.preprocessing import maybe_transpose
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+
+from sb3_mcbs.agents.hyperparameters import settings_of_preset
+from sb3_mcbs.agents.learned_search import make_searcher
+from sb3_mcbs.agents.mcbs import MCBS
+from sb3_mcbs.search import SearchResult, SearchSettings, with_preset
+from sb3_mcbs.snapshot import SnapshotEnvWrapper
+
+#: What is not simply replaced when it is set.
+_HELD = ("model", "vec_env", "settings")
+
+
+class SearchPolicy:
+    """
+    A trained agent that looks ahead before it acts, with SB3's ``predict`` signature.
+
+    Every call of :meth:`predict` plans from the present states of ``vec_env``, so the actions are for that
+    environment and no other::
+
+        policy = SearchPolicy(model, vec_env, beam_width=6, rollout_depth=3)
+        evaluate_policy(policy, vec_env)
+
+    SAC and TQC propose their mean action; TQC's value is the mean over quantiles that ``tqc_value`` says.
+    Settings are attributes: one that is set (``policy.beam_width = 20``) holds from the next decision on, and
+    ``policy.settings = ...`` sets them all. Attributes that this class does not have are those of the agent
+    (``save``, ``get_env``, ``logger``, ...).
+
+    :param model: a TD3, DDPG, SAC or TQC agent, or one that searched in training (
+        :class:`~sb3_mcbs.MCBS`)
+    :param vec_env: the environment to act in, at most wrapped further by ``VecEnv`` wrappers that alter
+        nothing. Environments in this process are wrapped for snapshots in place. A ``gym.Env`` must be
+        wrapped in :class:`~sb3_mcbs.SnapshotEnvWrapper` outermost.
+    :param seed: seed of the search's own generator; None: a fresh one
+    :param normalize_reward: whether the critics were trained on rewards that ``VecNormalize`` scaled.
+        None: found out from the environment that the agent was trained in, or assumed from the statistics
+    :param preset: a name of :data:`~sb3_mcbs.search.PRESETS`: where the settings start from, instead of
+        those that the agent trained with
+    :param search_settings: the fields of :class:`~sb3_mcbs.SearchSettings`; those not given are
+        those that the agent trained with, or the preset's, or the defaults
+    """
+
+    def __init__(
+        self,
+        model: OffPolicyAlgorithm,
+        vec_env: VecEnv | gym.Env,
+        seed: int | None = None,
+        normalize_reward: bool | None = None,
+        preset: str | None = None,
+        **search_settings: Any,
+    ) -> None:
+        unknown = sorted(set(search_settings) - set(SearchSettings.names()))
+        if unknown:
+            raise TypeError(f"Unknown search settings {unknown}; known are {list(SearchSettings.names())}.")
+        if normalize_reward is not None and not isinstance(normalize_reward, bool):
+            raise TypeError(f"normalize_reward must be True, False or None, got {normalize_reward!r}.")
+        self.model = model
+        if preset is None and isinstance(model, MCBS):
+            if search_settings.get("rollout_depth") == 0:  # where nothing simulates, no model does
+                search_settings = {"forward_model": "auto", **search_settings}
+            self.settings = replace(model.search_settings, **search_settings)
+        else:
+            self.settings = SearchSettings(**with_preset(preset, search_settings))
+        self.vec_env = _as_agents_vec_env(vec_env, model)
+        self.rng = np.random.default_rng(seed)
+        self.last_result: SearchResult | None = None
+        # A copy, so that acting elsewhere does not change the training.
+        recent_actions = deepcopy(model.recent_actions) if isinstance(model, MCBS) else None
+        self.searcher = make_searcher(model, self.vec_env, self.settings, normalize_reward, recent_actions)
+
+    def _follow_settings(self) -> None:
+        """Search with the present settings from the next decision on."""
+        before = self.searcher
+        if before.follow(self.settings):
+            return
+        make = partial(make_searcher, self.model, self.vec_env, self.settings)
+        self.searcher = make(before.normalize_reward, before.recent_actions)
+        before.close()
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        attributes = vars(self)
+        if "searcher" not in attributes or (name in attributes and name not in _HELD):
+            super().__setattr__(name, value)
+        elif name in ("model", "vec_env"):
+            raise AttributeError(f"The {name} of a SearchPolicy cannot be exchanged: make another one.")
+        elif name == "settings":
+            self._change_settings(value)
+        elif name == "preset":
+            self.settings = replace(self.settings, **_of_the_search(settings_of_preset(value)))
+        elif name in SearchSettings.names():
+            self.settings = replace(self.settings, **{name: value})
+        elif hasattr(self.model, name):
+            setattr(self.model, name, value)
+        else:
+            super().__setattr__(name, value)
+
+    def _change_settings(self, settings: SearchSettings) -> None:
+        if not isinstance(settings, SearchSettings):
+            raise TypeError(f"Expected SearchSettings, got {settings!r}.")
+        before, vars(self)["settings"] = self.settings, settings
+        try:
+            self._follow_settings()
+        except Exception:
+            vars(self)["settings"] = before
+            self._follow_settings()
+            raise
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """
+        Search for the best actions in the present states of ``vec_env``.
+
+        :param observation: the present observations of ``vec_env``; images also with the channels last
+        :param state: not used
+        :param episode_start: not used
+        :param deterministic: has no effect. The best candidate is always taken, without exploration noise;
+            the candidates are random draws from this object's own generator in either case, so the same
+            ``seed`` and the same calls give the same actions.
+        :return: the actions and ``state``
+        """
+        space = self.model.observation_space
+        batched, is_single = _add_batch_axis(_channels_first(observation, space), space)
+        self.last_result = self.searcher.search(batched, self.rng)
+        self.searcher.note_actions(self.last_result.actions)
+        actions = self.searcher.unscale(self.last_result.actions)
+        return (actions[0] if is_single else actions), state
+
+    def close(self) -> None:
+        """Release the forward model. The agent and the environment stay open."""
+        self.searcher.close()
+
+    def __getattr__(self, name: str) -> Any:
+        if name in ("model", "settings") or name.startswith("__"):
+            raise AttributeError(name)
+        return getattr(self.settings if name in SearchSettings.names() else self.model, name)
+
+
+def _of_the_search(settings: dict[str, Any]) -> dict[str, Any]:
+    return {name: settings[name] for name in SearchSettings.names() if name in settings}
+
+
+def _as_vec_env(env: VecEnv | gym.Env) -> VecEnv:
+    if isinstance(env, VecEnv):
+        return env
+    if isinstance(env, SnapshotEnvWrapper):
+        return DummyVecEnv([lambda: env])
+    raise TypeError(
+        f"SearchPolicy plans from the states of a vectorized environment, got {type(env).__name__}. Pass "
+        "make_vec_env(...), or a gym.Env wrapped in SnapshotEnvWrapper outermost, and act in the same object."
+    )
+
+
+def _as_agents_vec_env(env: VecEnv | gym.Env, model: OffPolicyAlgorithm) -> VecEnv:
+    """Return an environment to act in as the agent sees it.
+
+    :raises ValueError: if its spaces are not the agent's.
+    """
+    vec_env = OffPolicyAlgorithm._wrap_env(_as_vec_env(env), monitor_wrapper=False)  # transposes images
+    for what, ours, its, alike in (
+        ("observation", vec_env.observation_space, model.observation_space, _are_alike),
+        ("action", vec_env.action_space, model.action_space, operator.eq),
+    ):
+        if not alike(ours, its):
+            raise ValueError(
+                f"The agent was trained with the {what} space {its}, and vec_env has {ours}. Make the "
+                "environment with the same id, arguments and wrappers as for the training."
+            )
+    return vec_env
+
+
+def _are_alike(one: gym.Space, other: gym.Space) -> bool:
+    """Whether observations of two spaces have the same entries; their bounds do not matter to an agent."""
+    if isinstance(one, gym.spaces.Dict) and isinstance(other, gym.spaces.Dict):
+        return one.spaces.keys() == other.spaces.keys() and all(_are_alike(one[k], other[k]) for k in one)
+    if isinstance(one, gym.spaces.Box) and isinstance(other, gym.spaces.Box):
+        return one.shape == other.shape
+    return one == other
+
+
+def _channels_first(observation: Any, space: gym.Space) -> Any:
+    """Transpose images as SB3's ``predict`` does."""
+    if isinstance(space, gym.spaces.Dict):
+        return {key: _channels_first(value, space[key]) for key, value in observation.items()}
+    return maybe_transpose(np.asarray(observation), space)
+
+
+def _add_batch_axis(observation: Any, space: gym.Space) -> tuple[Any, bool]:
+    """Give a single observation the axis of environments.
+
+    :return: the batched observation, and whether the axis was added.
+    """
+    if isinstance(space, gym.spaces.Dict):
+        key = next(iter(space.spaces))
+        is_single = np.ndim(observation[key]) == len(space[key].shape or ())
+        return (
+            {k: np.asarray(v)[None] for k, v in observation.items()} if is_single else observation
+        ), is_single
+    is_single = np.ndim(observation) == len(space.shape or ())
+    return (np.asarray(observation)[None] if is_single else observation), is_single

@@ -1,0 +1,125 @@
+"""What an SB3 model file says, read without opening its pickles."""
+
+import io
+import json
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch as th
+from torch import nn
+
+from sb3_mcbs.loading.archive import AgentFileError, naming, read_members
+
+MAX_DATA_BYTES = 2**24
+MAX_POLICY_BYTES = 2**29
+MAX_VARIABLES_BYTES = 2**16
+VARIABLES = "pytorch_variables.pth"
+#: Shapes of what SB3 keeps of an entropy coefficient: the logarithm of a learned one, or a given one.
+_ENTROPY_SHAPES = {"log_ent_coef": (1,), "ent_coef_tensor": ()}
+
+
+@dataclass(frozen=True)
+class AgentFile:
+    """The parts of a model file that are data.
+
+    :param path: the file.
+    :param data: the JSON entries; an entry that :func:`is_pickled` holds a pickle as text.
+    :param tensors: the policy's parameters by name.
+    :param unread: the members that were not read.
+    """
+
+    path: Path
+    data: dict[str, Any]
+    tensors: dict[str, th.Tensor]
+    unread: list[str]
+
+
+def is_pickled(entry: Any) -> bool:
+    """Whether SB3 stored an entry as a pickle.
+
+    :param entry: a value of the JSON.
+    :return: whether SB3's own loader would unpickle it.
+    """
+    return isinstance(entry, dict) and ":serialized:" in entry
+
+
+def read_agent_file(path: str | Path) -> AgentFile:
+    """Read the JSON and the policy's parameters.
+
+    :param path: a zip file that ``save`` of an SB3 algorithm wrote; ``.zip`` may be left out.
+    :return: what the file says.
+    :raises FileNotFoundError: if there is no such file.
+    :raises AgentFileError: if the file is damaged, too large or of another kind.
+    """
+    path = Path(path)
+    if not path.is_file():
+        path = path.with_name(f"{path.name}.zip")
+    contents, names = read_members(path, {"data": MAX_DATA_BYTES, "policy.pth": MAX_POLICY_BYTES})
+    for name in ("data", "policy.pth"):
+        if name not in contents:
+            raise AgentFileError(f"{path} is no SB3 model file: it has no member {name!r}.")
+    with naming(path, "'data'"):
+        data = json.loads(contents["data"].decode())
+    if not isinstance(data, dict):
+        raise AgentFileError(f"{path}: 'data' must be a JSON object, not a {type(data).__name__}.")
+    unread = [name for name in names if name not in contents]
+    return AgentFile(path, data, _read_tensors(path, "policy.pth", contents["policy.pth"]), unread)
+
+
+def read_entropy_coefficient(path: Path) -> dict[str, th.Tensor]:
+    """Read the entropy coefficient of a SAC or TQC agent.
+
+    :param path: a zip file that ``save`` of an SB3 algorithm wrote.
+    :return: by the name of SB3's attribute, the coefficient or the logarithm of a learned one; empty if the
+        file has none.
+    :raises AgentFileError: if it is damaged, or no coefficient.
+    """
+    contents, _ = read_members(path, {VARIABLES: MAX_VARIABLES_BYTES})
+    variables = _read_tensors(path, VARIABLES, contents[VARIABLES]) if contents else {}
+    found = {name: variables[name] for name in _ENTROPY_SHAPES if name in variables}
+    for name, tensor in found.items():
+        coefficient = tensor.exp() if name == "log_ent_coef" else tensor
+        if tuple(tensor.shape) != _ENTROPY_SHAPES[name] or not 0 <= float(coefficient) < float("inf"):
+            raise AgentFileError(
+                f"{path}: {name} must be one number, and the coefficient finite and from 0 on."
+            )
+    return found
+
+
+def _read_tensors(path: Path, member: str, content: bytes) -> dict[str, th.Tensor]:
+    with naming(path, f"{member!r}"):
+        if content.startswith(b"PK\x03\x04"):
+            _check_not_compressed(path, member, content)
+        state = th.load(io.BytesIO(content), map_location="cpu", weights_only=True, mmap=False)
+    if not isinstance(state, dict):
+        raise AgentFileError(f"{path}: {member!r} must hold tensors by name, not a {type(state).__name__}.")
+    n_bytes = 0
+    for name, tensor in state.items():
+        _check_kind(path, member, name, tensor)
+        n_bytes += tensor.numel() * tensor.element_size()
+        # Tensors may share memory or repeat it, so a small file can claim any size.
+        if n_bytes > len(content):
+            raise AgentFileError(f"{path}: the tensors of {member!r} are larger than their file.")
+    for name, tensor in state.items():
+        if not bool(th.isfinite(tensor).all()):
+            raise AgentFileError(f"{path}: tensor {name!r} has values that are infinite or not a number.")
+    return {name: tensor.detach() for name, tensor in state.items()}
+
+
+def _check_not_compressed(path: Path, member: str, content: bytes) -> None:
+    """Refuse a torch file whose members, which torch stores as they are, claim to be larger than the file."""
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        if sum(info.file_size for info in archive.infolist()) > len(content):
+            raise AgentFileError(f"{path}: the members of {member!r} are larger than their file.")
+
+
+def _check_kind(path: Path, member: str, name: Any, tensor: Any) -> None:
+    if not isinstance(name, str) or type(tensor) not in (th.Tensor, nn.Parameter):
+        raise AgentFileError(f"{path}: {member!r} must hold only tensors by name; {str(name)[:80]!r} is not.")
+    if tensor.dtype != th.float32 or tensor.layout != th.strided or tensor.device.type != "cpu":
+        raise AgentFileError(
+            f"{path}: tensor {name[:80]!r} must be dense float32, got {tensor.layout} {tensor.dtype} on "
+            f"{tensor.device}."
+        )

@@ -1,0 +1,163 @@
+"""The networks of an SB3 policy, told from the names and shapes of its parameters."""
+
+import itertools
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import get_action_dim, get_flattened_obs_dim, is_image_space
+
+from sb3_mcbs.loading.archive import AgentFileError
+
+Shape = tuple[int, ...]
+
+_USE_SB3 = "If you trust its author, use the load method of the SB3 algorithm: it runs code from the file."
+
+
+@dataclass(frozen=True)
+class Architecture:
+    """Sizes of multi-layer perceptrons.
+
+    :param stochastic: whether the actor has a standard deviation (SAC, TQC).
+    :param actor: the actor's hidden layers.
+    :param critic: each critic's hidden layers.
+    :param n_critics: how many critics there are.
+    :param n_outputs: a critic's outputs; with several they are quantiles (TQC).
+    :param use_sde: whether the exploration depends on the state (gSDE).
+    :param clips_mean: whether the actor clips its mean before it is squashed; only with gSDE.
+    """
+
+    stochastic: bool
+    actor: list[int]
+    critic: list[int]
+    n_critics: int
+    n_outputs: int
+    use_sde: bool
+    clips_mean: bool
+
+    def shapes(self, n_features: int, n_actions: int) -> dict[str, Shape]:
+        """All parameters that an SB3 policy of this architecture has.
+
+        :param n_features: numbers in an observation.
+        :param n_actions: numbers in an action.
+        :return: shapes by name.
+        """
+        shapes: dict[str, Shape] = {}
+        if self.stochastic:
+            shapes |= self._stochastic_actor(n_features, n_actions)
+        else:
+            for actor in ("actor", "actor_target"):
+                shapes |= _layers(f"{actor}.mu", [n_features, *self.actor, n_actions])
+        critic = [n_features + n_actions, *self.critic, self.n_outputs]
+        for name, index in itertools.product(("critic", "critic_target"), range(self.n_critics)):
+            shapes |= _layers(f"{name}.qf{index}", critic)
+        return shapes
+
+    def _stochastic_actor(self, n_features: int, n_actions: int) -> dict[str, Shape]:
+        latent = [n_features, *self.actor]
+        last = [latent[-1], n_actions]
+        shapes = _layers("actor.latent_pi", latent)
+        if not self.use_sde:
+            return shapes | _linear("actor.mu", *last) | _linear("actor.log_std", *last)
+        mean = "actor.mu.0" if self.clips_mean else "actor.mu"
+        return shapes | _linear(mean, *last) | {"actor.log_std": tuple(last)}
+
+
+def _linear(name: str, n_inputs: int, n_outputs: int) -> dict[str, Shape]:
+    return {f"{name}.weight": (n_outputs, n_inputs), f"{name}.bias": (n_outputs,)}
+
+
+def _layers(prefix: str, widths: list[int]) -> dict[str, Shape]:
+    shapes: dict[str, Shape] = {}
+    for index, (n_inputs, n_outputs) in enumerate(itertools.pairwise(widths)):
+        # Every second module is an activation function, which has no parameters.
+        shapes |= _linear(f"{prefix}.{2 * index}", n_inputs, n_outputs)
+    return shapes
+
+
+def _widths(shapes: Mapping[str, Shape], prefix: str) -> Iterator[int]:
+    for index in itertools.count(0, 2):
+        shape = shapes.get(f"{prefix}.{index}.weight")
+        if not shape:
+            return
+        yield shape[0]
+
+
+def read_architecture(shapes: Mapping[str, Shape]) -> Architecture:
+    """Tell the architecture from parameters that may not fit together; :func:`check_shapes` finds that.
+
+    :param shapes: shapes by name.
+    :return: what the names and the output sizes say.
+    :raises AgentFileError: if they are not those of an actor and critics that are MLPs.
+    """
+    for name in shapes:
+        if "features_extractor" in name:
+            raise AgentFileError(
+                f"The policy extracts features ({name[:80]!r}), as CnnPolicy and MultiInputPolicy do; only "
+                f"the networks of an MlpPolicy can be told from a file's tensors. {_USE_SB3}"
+            )
+    stochastic = any(name.startswith("actor.log_std") for name in shapes)
+    actor = list(_widths(shapes, "actor.latent_pi" if stochastic else "actor.mu"))
+    critic = list(_widths(shapes, "critic.qf0"))
+    if not critic or not (actor or stochastic):
+        raise AgentFileError(
+            "The policy's tensors are not those of a TD3, DDPG, SAC or TQC agent: these have "
+            f"'actor.*' and 'critic.qf0.*'; the file has {str(sorted(shapes)[:4])[:200]}."
+        )
+    critic_indices = itertools.takewhile(lambda i: f"critic.qf{i}.0.weight" in shapes, itertools.count())
+    return Architecture(
+        stochastic=stochastic,
+        actor=actor if stochastic else actor[:-1],
+        critic=critic[:-1],
+        n_critics=len(list(critic_indices)),
+        n_outputs=critic[-1],
+        use_sde="actor.log_std" in shapes,
+        clips_mean="actor.mu.0.weight" in shapes,
+    )
+
+
+def check_spaces(observation_space: spaces.Space, action_space: spaces.Space) -> None:
+    """Refuse an environment that an MLP agent cannot act in.
+
+    :param observation_space: its observations.
+    :param action_space: its actions.
+    :raises ValueError: if observations are images or of several inputs, or actions not a Box.
+    """
+    if isinstance(observation_space, spaces.Dict | spaces.Tuple) or is_image_space(observation_space):
+        raise ValueError(
+            "load_agent reads agents with an MlpPolicy, whose observations are vectors; the environment's "
+            f"are {observation_space}. {_USE_SB3}"
+        )
+    if not isinstance(action_space, spaces.Box):
+        raise ValueError(f"The agent needs continuous (Box) actions, the environment has {action_space}.")
+
+
+def check_shapes(
+    shapes: Mapping[str, Shape],
+    architecture: Architecture,
+    observation_space: spaces.Space,
+    action_space: Any,
+) -> None:
+    """Refuse parameters that do not fit together, or not the environment.
+
+    :param shapes: the file's shapes by name.
+    :param architecture: what was told from them.
+    :param observation_space: the environment's observations.
+    :param action_space: the environment's actions.
+    :raises AgentFileError: if a parameter is missing, left over or of another shape.
+    """
+    expected = architecture.shapes(get_flattened_obs_dim(observation_space), get_action_dim(action_space))
+    for name in sorted(expected.keys() | shapes.keys()):
+        if name not in shapes:
+            raise AgentFileError(f"The policy's tensor {name!r} is missing, the file is not complete.")
+        if name not in expected:
+            raise AgentFileError(
+                f"The policy has a tensor {name[:80]!r} that SB3's MlpPolicy does not have. {_USE_SB3}"
+            )
+        if shapes[name] != expected[name]:
+            raise AgentFileError(
+                f"Tensor {name!r} has the shape {shapes[name]}, but {expected[name]} is needed: for the "
+                f"environment's observations {observation_space.shape} and actions {action_space.shape}, and "
+                "for the layers beside it. Is it the environment that the agent was trained in?"
+            )

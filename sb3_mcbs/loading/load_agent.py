@@ -1,0 +1,254 @@
+"""Loading an agent from a file whose author nobody knows."""
+
+import functools
+import logging
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+import torch as th
+from sb3_contrib import TQC
+from stable_baselines3 import SAC
+from stable_baselines3.common.base_class import maybe_make_env
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.type_aliases import GymEnv
+
+from sb3_mcbs.agents.mcbs import MCBS
+from sb3_mcbs.agents.registry import ALGORITHMS
+from sb3_mcbs.loading.agent_file import (
+    VARIABLES,
+    AgentFile,
+    is_pickled,
+    read_agent_file,
+    read_entropy_coefficient,
+)
+from sb3_mcbs.loading.architecture import Architecture, check_shapes, check_spaces, read_architecture
+from sb3_mcbs.loading.archive import AgentFileError
+from sb3_mcbs.loading.network_settings import is_number, network_settings
+from sb3_mcbs.search import SearchSettings
+
+logger = logging.getLogger("sb3_mcbs")
+
+
+def load_agent(
+    path: str | Path,
+    env: GymEnv | str,
+    algo: str | None = None,
+    policy_kwargs: dict[str, Any] | None = None,
+    device: th.device | str = "auto",
+) -> OffPolicyAlgorithm:
+    """
+    Load an agent from an SB3 model file without running code from the file, to act (not to train).
+
+    SB3's ``load`` opens the pickles in the file, and that runs whatever their author wants. Here only tensors
+    and a few checked numbers are read: the networks' sizes and the algorithm are told from the tensors, the
+    spaces are those of ``env``. The agent can ``predict`` and be given to :class:`~sb3_mcbs.SearchPolicy`; it
+    has neither optimisers nor a replay buffer, so ``learn``, ``train`` and ``save`` refuse.
+
+    What was not taken over is listed in the agent's attribute ``not_taken_over``, a dictionary of reasons by
+    the name of the entry or member, and logged (``sb3_mcbs``); what may change how the agent acts, as a
+    warning.
+
+    :param path: the file, as ``save`` of TD3, DDPG, SAC, TQC or one of their MCBS agents wrote it, with an
+        ``MlpPolicy``
+    :param env: the environment to act in; its spaces must be those of the training
+    :param algo: ``"td3"``, ``"ddpg"``, ``"sac"``, ``"tqc"``, or one of these after ``"mcbs_"``; None: as the
+        file says
+    :param policy_kwargs: what the agent was trained with, for files that do not say it readably. Needed is
+        what tensors do not tell: ``activation_fn``, with gSDE ``clip_mean`` and ``use_expln``.
+    :param device: device on which the networks run
+    :return: the agent, ready to act
+    :raises FileNotFoundError: if there is no such file
+    :raises AgentFileError: if the file is damaged, too large, of another kind or not for this environment
+    :raises ValueError: if ``algo`` or ``env`` cannot be used, or the file does not say something that
+        ``policy_kwargs`` must say
+    """
+    env = maybe_make_env(env, verbose=0)
+    check_spaces(env.observation_space, env.action_space)
+    file = read_agent_file(path)
+    with _about(file.path):
+        shapes = {name: tuple(tensor.shape) for name, tensor in file.tensors.items()}
+        architecture = read_architecture(shapes)
+        check_shapes(shapes, architecture, env.observation_space, env.action_space)
+        name = _algorithm(file, architecture, algo)
+        networks = network_settings(file.data, architecture, policy_kwargs)
+        if issubclass(ALGORITHMS[name], TQC):
+            networks["n_quantiles"] = architecture.n_outputs
+        numbers, warnings = _numbers(file, name, architecture)
+        entropy = read_entropy_coefficient(file.path) if architecture.stochastic else {}
+    warnings += _differing_bounds(file, env.action_space)
+    agent = _build(ALGORITHMS[name], env, networks, numbers, architecture.use_sde, device, file.tensors)
+    for attribute, tensor in entropy.items():
+        setattr(agent, attribute, tensor.to(agent.device))
+    for warning in warnings:
+        logger.warning("%s: %s", file.path, warning)
+    left = _not_taken_over(file, {*numbers, "use_sde"}, policy_kwargs)
+    if entropy:
+        del left[VARIABLES]
+    agent.not_taken_over = left  # type: ignore[attr-defined]
+    kind, activation = type(agent).__name__, networks["activation_fn"].__name__
+    logger.info("%s: loaded as %s with %s. Not taken over: %s", file.path, kind, activation, list(left))
+    return agent
+
+
+@contextmanager
+def _about(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except ValueError as reason:
+        kind = AgentFileError if isinstance(reason, AgentFileError) else ValueError
+        raise kind(f"{path}: {reason}") from reason
+
+
+def _algorithm(file: AgentFile, architecture: Architecture, algo: str | None) -> str:
+    if algo is None:
+        if architecture.stochastic:
+            is_tqc = architecture.n_outputs > 1 or "top_quantiles_to_drop_per_net" in file.data
+            algo = "tqc" if is_tqc else "sac"
+        else:
+            algo = "ddpg" if architecture.n_critics == 1 else "td3"
+        if "beam_width" in file.data:
+            algo = f"mcbs_{algo}"
+    if algo not in ALGORITHMS:
+        raise ValueError(f"algo must be one of {list(ALGORITHMS)}, got {algo!r}.")
+    cls = ALGORITHMS[algo]
+    one_output = architecture.n_outputs == 1 or issubclass(cls, TQC)
+    if architecture.stochastic != issubclass(cls, SAC | TQC) or not one_output:
+        kind = "a stochastic" if architecture.stochastic else "a deterministic"
+        raise AgentFileError(
+            f"The file is not of the algorithm {algo!r}: it has {kind} actor and critics with "
+            f"{architecture.n_outputs} output(s)."
+        )
+    return algo
+
+
+def _is_entropy_coefficient(value: Any) -> bool:
+    if isinstance(value, str):
+        return re.fullmatch(r"auto(_(\d+\.?\d*|\.\d+)(e[-+]?\d+)?)?", value[:80]) is not None
+    return is_number(value) and value >= 0
+
+
+def _numbers(file: AgentFile, algo: str, architecture: Architecture) -> tuple[dict[str, Any], list[str]]:
+    """The numbers of the file that are taken over, by name, and warnings about those that cannot be."""
+    checks: dict[str, tuple[Callable[[Any], bool], str]] = {
+        "gamma": (lambda value: is_number(value) and 0 < value <= 1, "a number above 0 and up to 1")
+    }
+    if issubclass(ALGORITHMS[algo], SAC | TQC):
+        checks["ent_coef"] = (_is_entropy_coefficient, "a number from 0 or 'auto'")
+    if issubclass(ALGORITHMS[algo], TQC):
+        checks["top_quantiles_to_drop_per_net"] = (
+            lambda value: type(value) is int and 0 <= value < architecture.n_outputs,
+            f"an integer from 0 to below the number of quantiles, {architecture.n_outputs}",
+        )
+    settings = (
+        SearchSettings.names() if "beam_width" in file.data and issubclass(ALGORITHMS[algo], MCBS) else ()
+    )
+    values, warnings = {}, []
+    for name in (*checks, *settings):
+        if name not in file.data or is_pickled(file.data[name]):
+            warnings.append(
+                f"{name} is not there as a plain value; the default is used. Set it on the agent."
+            )
+        elif name in checks and not checks[name][0](file.data[name]):
+            raise AgentFileError(f"{name} must be {checks[name][1]}, got {str(file.data[name])[:80]!r}.")
+        else:
+            values[name] = file.data[name]
+    try:
+        SearchSettings(**{name: value for name, value in values.items() if name in settings})
+    except (TypeError, ValueError, OverflowError) as reason:
+        raise AgentFileError(f"search settings: {str(reason)[:300]}") from reason
+    return values, warnings
+
+
+def _differing_bounds(file: AgentFile, action_space: Any) -> list[str]:
+    """Compare the actions' bounds with the readable copy in the file, as far as that can be read."""
+    space = file.data.get("action_space")
+    for name in ("low", "high"):
+        text = str(space.get(name)) if isinstance(space, dict) else ""
+        try:
+            declared = np.array(re.sub(r"[\[\],]", " ", text).split(), dtype=np.float64)
+        except ValueError:  # not there, or shortened
+            continue
+        bound = getattr(action_space, name).ravel()
+        if declared.shape == bound.shape and not np.allclose(declared, bound, rtol=1e-4):
+            return [
+                f"the environment's actions end at {name}={bound.tolist()}, those of the training at "
+                f"{declared.tolist()}; the agent's actions are scaled to the environment's."
+            ]
+    return []
+
+
+class NoOptimizer:
+    """Takes the place of an optimiser in the policy of an agent that only acts.
+
+    :param parameters: not used
+    :param lr: not used
+    """
+
+    def __init__(self, parameters: Any, lr: float) -> None:
+        pass
+
+
+def _build(
+    cls: type[Any],
+    env: GymEnv,
+    networks: dict[str, Any],
+    numbers: dict[str, Any],
+    use_sde: bool,
+    device: th.device | str,
+    tensors: dict[str, th.Tensor],
+) -> OffPolicyAlgorithm:
+    settings = numbers | ({"use_sde": use_sde} if issubclass(cls, SAC | TQC) else {})
+    agent = cls(
+        "MlpPolicy",
+        env,
+        policy_kwargs={**networks, "optimizer_class": NoOptimizer},
+        device=device,
+        _init_setup_model=False,
+        **settings,
+    )
+    # Initial weights, which are replaced, are no reason to advance the caller's random numbers.
+    with th.random.fork_rng(devices=[]):
+        policy = agent.policy_class(
+            agent.observation_space, agent.action_space, lambda _: 0.0, **agent.policy_kwargs
+        )
+    policy.load_state_dict(tensors)
+    policy.set_training_mode(False)
+    agent.policy = policy.to(agent.device)
+    agent._create_aliases()
+    if use_sde:
+        agent.policy.reset_noise()
+    for method in ("learn", "train", "save"):
+        setattr(agent, method, functools.partial(_refuse, method, cls.__name__))
+    return agent
+
+
+def _refuse(method: str, algorithm: str, *args: Any, **kwargs: Any) -> NoReturn:
+    raise RuntimeError(
+        f"An agent of load_agent only acts: it has no optimiser and no replay buffer to {method} with. If "
+        f"you trust the file's author, use {algorithm}.load(path, env=env): it runs code from the file."
+    )
+
+
+def _not_taken_over(file: AgentFile, taken: set[str], policy_kwargs: dict[str, Any] | None) -> dict[str, str]:
+    reasons = {
+        name: "a pickle, which is not opened" if is_pickled(value) else "not needed to act"
+        for name, value in file.data.items()
+        if name not in taken
+    }
+    reasons |= dict.fromkeys(
+        reasons.keys() & {"observation_space", "action_space"}, "the environment's is used"
+    )
+    if policy_kwargs is not None:
+        reasons["policy_kwargs"] = "those of the caller are used"
+    elif is_pickled(file.data["policy_kwargs"]):
+        reasons["policy_kwargs"] = "a pickle, which is not opened; the readable copy beside it is used"
+    else:
+        del reasons["policy_kwargs"]
+    if "activation_fn" not in (file.data["policy_kwargs"] if policy_kwargs is None else policy_kwargs):
+        reasons["policy_kwargs: activation_fn"] = "not there, so it is SB3's default, ReLU"
+    reasons |= dict.fromkeys(file.unread, "a member that is not read")
+    return {name[:80]: reason for name, reason in reasons.items()}

@@ -1,0 +1,174 @@
+"""SB3's networks as MLPs, where they are as SB3 makes them. Whatever else was done to them, SB3 runs.
+
+A network may be changed at any time: layers replaced or frozen, hooks put on it, another one in its place. So
+nothing of what is found out here is kept: whoever searches or trains asks anew.
+"""
+
+from typing import Any
+
+import torch as th
+from gymnasium import spaces
+from sb3_contrib.tqc.policies import Actor as TQCActor
+from sb3_contrib.tqc.policies import Critic as TQCCritic
+from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution
+from stable_baselines3.common.policies import BaseModel, ContinuousCritic
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.torch_layers import FlattenExtractor
+from stable_baselines3.sac.policies import Actor as SACActor
+from stable_baselines3.td3.policies import Actor as TD3Actor
+from torch import nn
+from torch.nn.modules import module as torch_module
+from torch.optim import optimizer as torch_optimizer
+
+from sb3_mcbs.networks.mlp import MLP, own_state
+
+#: Neither subclasses nor wrappers of these, which may do something else.
+_NETWORKS: tuple[type[nn.Module], ...] = (TD3Actor, SACActor, TQCActor, ContinuousCritic, TQCCritic)
+_LAYERS = (nn.Linear, nn.ReLU, nn.Tanh, nn.Sequential, nn.Flatten, FlattenExtractor)
+
+
+def _methods(cls: type) -> frozenset[str]:
+    return frozenset(name for name in dir(cls) if callable(getattr(cls, name)))
+
+
+_METHODS = {cls: _methods(cls) for cls in (*_NETWORKS, th.optim.Adam)}
+#: What calling a network calls. Somebody may put something else in its place.
+_CALLED = [
+    (cls, name, getattr(cls, name))
+    for cls, name in (
+        *((cls, "forward") for cls in (*_NETWORKS, *_LAYERS)),
+        (nn.Module, "__call__"),
+        (nn.Module, "_call_impl"),
+        (BaseModel, "extract_features"),
+        (ContinuousCritic, "q1_forward"),
+        (SACActor, "get_action_dist_params"),
+        (TQCActor, "get_action_dist_params"),
+    )
+]
+_TANH = nn.Tanh()
+
+
+def _check_everywhere() -> None:
+    """Refuse what is done to every call of every network."""
+    if (
+        torch_module._global_forward_hooks
+        or torch_module._global_forward_pre_hooks
+        or torch_module._global_backward_hooks
+        or torch_module._global_backward_pre_hooks
+    ):
+        raise TypeError("there are hooks for all modules")
+    for cls, name, method in _CALLED:
+        if getattr(cls, name) is not method:
+            raise TypeError(f"{cls.__name__}.{name} was replaced")
+    if th.is_autocast_enabled("cpu") or th.is_autocast_enabled("cuda"):
+        raise TypeError("autocast is on")
+
+
+def _check_plain(network: Any) -> Any:
+    """Refuse an actor or critic that does more than flatten observations and call its layers.
+
+    :return: its modules by their names.
+    """
+    _check_everywhere()
+    if type(network) not in _NETWORKS:
+        raise TypeError(f"{type(network).__name__} is not an actor or critic of a known kind")
+    state = own_state(network)
+    if not _METHODS[type(network)].isdisjoint(state):
+        raise TypeError(f"a method of {type(network).__name__} was replaced")
+    space = network.observation_space
+    if not isinstance(space, spaces.Box) or (network.normalize_images and is_image_space(space)):
+        raise TypeError("observations are not vectors of numbers")
+    modules = state["_modules"]
+    _check_flattens(modules.get("features_extractor"))
+    return modules
+
+
+def _check_flattens(extractor: Any) -> None:
+    if type(extractor) is not FlattenExtractor:
+        raise TypeError(f"features are extracted by a {type(extractor).__name__}")
+    state = own_state(extractor)
+    flatten = state["_modules"].get("flatten")
+    if type(flatten) is not nn.Flatten or (flatten.start_dim, flatten.end_dim) != (1, -1):
+        raise TypeError("observations are not flattened")
+    own = own_state(flatten)
+    if len(state["_modules"]) > 1 or own["_modules"] or state["_parameters"] or own["_parameters"]:
+        raise TypeError("what flattens observations has parameters")
+
+
+def actor_mlp(actor: Any) -> MLP:
+    """An actor's deterministic action as an MLP.
+
+    :param actor: an SB3 actor.
+    :return: float32 observations ``[obs_dim, rows]`` -> actions ``[act_dim, rows]`` in [-1, 1].
+    :raises TypeError: if the actor is more than an MLP.
+    """
+    modules = _check_plain(actor)
+    if type(actor) is TD3Actor:
+        return MLP(modules.get("mu"))
+    if type(actor) in (SACActor, TQCActor) and type(actor.action_dist) is SquashedDiagGaussianDistribution:
+        MLP(modules.get("log_std"))  # is called as well
+        return MLP(modules.get("latent_pi"), modules.get("mu"), _TANH)
+    raise TypeError(f"{type(actor).__name__} is not an actor whose mean action is an MLP")
+
+
+def critic_mlps(critic: Any) -> list[MLP]:
+    """The single networks of a critic.
+
+    :param critic: an SB3 critic.
+    :return: each: float32 observations above actions ``[obs_dim + act_dim, rows]`` -> ``[1, rows]`` or
+        quantiles ``[n_quantiles, rows]``.
+    :raises TypeError: if the critic is more than MLPs.
+    """
+    _check_plain(critic)
+    if type(critic) not in (ContinuousCritic, TQCCritic):
+        raise TypeError(f"{type(critic).__name__} is not a critic of a known kind")
+    return [MLP(network) for network in critic.q_networks]
+
+
+def parameters_of(network: Any, mlps: list[MLP]) -> list[nn.Parameter]:
+    """The parameters of a TD3 actor, or of a critic.
+
+    :param network: the actor or critic.
+    :param mlps: what it calculates.
+    :return: as its ``parameters()``.
+    :raises TypeError: if it has others than those that it calculates with.
+    """
+    state = vars(network)
+    _, *called = state["_modules"].values()  # the first extracts features
+    expected = state.get("q_networks", called)
+    if state["_parameters"] or called != expected or len(called) != len(mlps):
+        raise TypeError(f"a {type(network).__name__} has other modules than those that it calls")
+    return [parameter for mlp in mlps for parameter in mlp.parameters]
+
+
+def check_trained(network: Any, parameters: list[nn.Parameter]) -> None:
+    """Refuse to train a network of which something else is asked than Adam's steps along gradients.
+
+    :param network: the actor or critic, with its optimizer.
+    :param parameters: its parameters.
+    :raises TypeError: says why.
+    """
+    optimizer: Any = network.optimizer
+    if type(optimizer) is not th.optim.Adam or len(optimizer.param_groups) != 1:
+        raise TypeError(
+            f"the optimizer is {type(optimizer).__name__}, not Adam with a single group of parameters"
+        )
+    if (
+        optimizer._optimizer_step_pre_hooks
+        or optimizer._optimizer_step_post_hooks
+        or torch_optimizer._global_optimizer_pre_hooks
+        or torch_optimizer._global_optimizer_post_hooks
+    ):
+        raise TypeError("an optimizer has hooks")
+    if not _METHODS[th.optim.Adam].isdisjoint(vars(optimizer)):
+        raise TypeError("a method of an optimizer was replaced")
+    group = optimizer.param_groups[0]
+    if [*map(id, group["params"])] != [*map(id, parameters)]:
+        raise TypeError("an optimizer does not hold the parameters of its network")
+    if group["differentiable"] or group["capturable"]:
+        raise TypeError("Adam is differentiable or capturable")
+    for parameter in parameters:
+        if not parameter.requires_grad:
+            raise TypeError("parameters are frozen")
+        if parameter._backward_hooks or parameter._post_accumulate_grad_hooks:
+            raise TypeError("parameters have hooks")
