@@ -8,7 +8,7 @@ STAMP := $(VENV)/.sb3-mcbs-installed
 
 help:
 	@echo "make train      set up $(VENV), train MCBS-TD3 on HalfCheetah-v5 for 20 000 steps, report"
-	@echo "make test       set up $(VENV), run the tests"
+	@echo "make test       set up $(VENV), run the tests on all cores (PYTEST_ARGS='-n 0': on one)"
 	@echo "make test-slow  the tests that build packages or take long"
 	@echo "make lint       ruff and mypy"
 	@echo "make format     ruff format, and what ruff check can repair"
@@ -30,7 +30,7 @@ train: $(STAMP)
 	$(BIN)/python -m sb3_mcbs.zoo.report --algo mcbs_td3 --env HalfCheetah-v5
 
 test: $(STAMP)
-	$(BIN)/python -m pytest $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -n auto $(PYTEST_ARGS)
 
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -m slow $(PYTEST_ARGS)

@@ -18,9 +18,8 @@ SWITCH = "SB3_MCBS_NO_ZOO_HOOK"
 # The last one is ours: whoever imports it first imports rl_zoo3.exp_manager half-way through it, when the
 # class that belongs into rl_zoo3.exp_manager does not exist yet.
 WATCHED = ("rl_zoo3.utils", "rl_zoo3.hyperparams_opt", "rl_zoo3.exp_manager", "sb3_mcbs.zoo.manager")
-# Commands that name the off-policy algorithms within their code. ``python -m`` runs that code and imports
-# nothing, so it is changed on the way.
-COMMANDS = ("rl_zoo3.enjoy", "rl_zoo3.record_video", "rl_zoo3.push_to_hub")
+# The command that says which library a failing renderer needs.
+RECORD_VIDEO = "rl_zoo3.record_video"
 # The system's library that MuJoCo draws pictures with, by the value of MUJOCO_GL.
 LIBRARIES = {"osmesa": "libosmesa6", "egl": "libegl1"}
 
@@ -32,18 +31,6 @@ def _register(module: "Any") -> None:
         registration.after_import(module)
     except Exception as error:
         _warn(module.__name__, error)
-
-
-def _extend(name: str, code: "Any") -> "Any":
-    if name == "rl_zoo3.record_video":
-        sys.excepthook = name_missing_library
-    try:
-        from sb3_mcbs.zoo import registration
-
-        return registration.with_our_off_policy_names(code)
-    except Exception as error:
-        _warn(name, error)
-        return code
 
 
 def _warn(name: str, error: Exception) -> None:
@@ -108,7 +95,7 @@ class ZooFinder:
         :param target: the module itself if it is being reloaded
         :return: the spec the other finders gave, or None for every module but the watched ones
         """
-        if fullname not in WATCHED and fullname not in COMMANDS:
+        if fullname not in WATCHED and fullname != RECORD_VIDEO:
             return None
         for finder in sys.meta_path:
             find_spec = getattr(finder, "find_spec", None)
@@ -117,7 +104,7 @@ class ZooFinder:
                 continue
             spec = find_spec(fullname, path, target)
             if spec is not None:
-                return _announcing(spec) if fullname in WATCHED else _extending(spec)
+                return _announcing(spec) if fullname in WATCHED else _naming_library(spec)
         return None
 
 
@@ -134,9 +121,15 @@ def _announcing(spec: "Any") -> "Any":
     return spec
 
 
-def _extending(spec: "Any") -> "Any":
+def _naming_library(spec: "Any") -> "Any":
+    # ``python -m`` runs the command's code and imports nothing.
     get_code = spec.loader.get_code
-    spec.loader.get_code = lambda name: _extend(name, get_code(name))
+
+    def get_code_and_name(name: str) -> "Any":
+        sys.excepthook = name_missing_library
+        return get_code(name)
+
+    spec.loader.get_code = get_code_and_name
     return spec
 
 

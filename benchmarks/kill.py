@@ -1,6 +1,6 @@
 """Runs that are killed again and again, against the same runs undisturbed: do they end alike, bit for bit?
 
-Every second SIGKILL hits while a checkpoint is being written, the others at random moments.
+Every second SIGKILL hits while a checkpoint is being written, the others at random clocks.
 """
 
 import argparse

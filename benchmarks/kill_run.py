@@ -45,9 +45,9 @@ CASES = {
 }
 ALGORITHMS: dict[str, tuple[type[OffPolicyAlgorithm], dict[str, Any]]] = {
     "mcbs_td3": (MCBSTD3, {"n_threads": 1}),
-    "mcbs_ddpg": (MCBSDDPG, {"n_threads": 1, "rollout_replay": 0.25}),
-    "mcbs_sac": (MCBSSAC, {"n_threads": 1, "use_sde": True, "entropy_bonus": True, "search_share": 0.5}),
-    "mcbs_tqc": (MCBSTQC, {"n_threads": 1, "preset": "balanced", "tqc_value": "truncated"}),
+    "mcbs_ddpg": (MCBSDDPG, {"n_threads": 1}),
+    "mcbs_sac": (MCBSSAC, {"n_threads": 1, "use_sde": True, "search_share": 0.5}),
+    "mcbs_tqc": (MCBSTQC, {"n_threads": 1, "preset": "balanced"}),
     "mcbs_td3 with schedules": (
         MCBSTD3,
         {
@@ -56,7 +56,6 @@ ALGORITHMS: dict[str, tuple[type[OffPolicyAlgorithm], dict[str, Any]]] = {
             "search_unit": "episode",
             "search_share": 0.7,
             "saturation_window": 1000,
-            "rollout_replay": 0.25,
         },
     ),
     "mcbs_td3 with expanded targets": (

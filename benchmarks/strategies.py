@@ -10,9 +10,9 @@ seeds and reported on another:
 
 The second runs what was best of each strategy and budget in the first, and the presets. Arms are named by
 their sizes: beam candidates x depth, tree width x branching x depth, refine width x rounds x depth; (2x3) is
-a depth of 2 macro-steps of 3 steps, "in 2" two directions, "of 48" critic pre-selection, "soft"
-entropy_bonus, "truncated" tqc_value. Arms that the file of results holds already are left out, but for
-``--again``. The third runs a hundred episodes, for agents that fall in some: ten say little of them.
+a depth of 2 macro-steps of 3 steps, "in 2" two directions, "of 48" critic pre-selection. Arms that
+the file of results holds already are left out, but for ``--again``. The third runs a hundred episodes, for
+agents that fall in some: ten say little of them.
 """
 
 import argparse
@@ -29,7 +29,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from benchmarks.common import known_path, parse_args, print_table, read, write, write_picture
-from benchmarks.strategies_arms import ARMS, BUDGETS, SLACK, has_value
+from benchmarks.strategies_arms import ARMS, BUDGETS, SLACK
 from sb3_mcbs import SearchPolicy, SearchSettings, SnapshotEnvWrapper, load_agent
 from sb3_mcbs.search import PRESETS
 
@@ -133,7 +133,7 @@ def reported_arms(rows: list[dict[str, Any]]) -> list[str]:
         best[ARMS[arm].get("strategy", "beam"), budget_of(arm)] = arm
     presets = [SearchSettings.preset(name) for name in PRESETS]
     wanted = {"actor alone", *best.values(), *(arm for arm in ARMS if SearchSettings(**ARMS[arm]) in presets)}
-    return [arm for arm in ARMS if arm in wanted or arm.endswith((", soft", ", truncated"))]
+    return [arm for arm in ARMS if arm in wanted]
 
 
 def by_cost(arms: list[str]) -> list[str]:
@@ -221,7 +221,7 @@ def run_arms(agent: OffPolicyAlgorithm, name: str, arms: list[str], arguments: a
             known.append(arm)
         elif SearchSettings(**settings).simulated_steps() > arguments.most:
             costly.append(arm)
-        elif has_value(agent, settings):
+        else:
             result = run_arm(agent, arguments.env, SEEDS[arguments.seeds], settings)
             # Others may have added arms meanwhile, so the file is read again.
             others = [other for other in read(FILE) if not row.items() <= other.items()]

@@ -2,10 +2,6 @@
 
 from typing import Any
 
-from sb3_contrib import TQC
-from stable_baselines3 import SAC
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-
 #: Simulated steps per decision that arms are compared at, and how far an arm may be from them.
 BUDGETS = (20, 60, 110, 580)
 SLACK = 0.15
@@ -58,7 +54,6 @@ ARMS: dict[str, dict[str, Any]] = {
     "refine 5x2x6 in 3": refine(5, 2, 6, proposal_dims=3),
     # about 110
     "beam 18x6": beam(18, 6),
-    "tree 6x6x3": tree(6, 6, 3, one_node_per_root=True),
     "tree 6x3x6": tree(6, 3, 6),
     "refine 12x3x3": refine(12, 3, 3),
     "refine 6x3x6": refine(6, 3, 6),
@@ -75,17 +70,4 @@ ARMS: dict[str, dict[str, Any]] = {
     "refine 16x4x9": refine(16, 4, 9, n_elites=4),
     "refine 12x4x12": refine(12, 4, 12, n_elites=4),
     "refine 16x3x(6x2)": refine(16, 3, 6, n_elites=4, noise_hold=2),
-    # other values, for agents that have them
-    "paper, soft": dict(entropy_bonus=True),
-    "paper, truncated": dict(tqc_value="truncated"),
-    "beam 6x3, soft": beam(6, 3, entropy_bonus=True),
-    "beam 6x3, truncated": beam(6, 3, tqc_value="truncated"),
-    "refine 12x3x3, truncated": refine(12, 3, 3, tqc_value="truncated"),
 }
-
-
-def has_value(agent: OffPolicyAlgorithm, settings: dict[str, Any]) -> bool:
-    """Whether an agent's networks give the values that settings ask for."""
-    if settings.get("tqc_value", "mean") != "mean" and not isinstance(agent, TQC):
-        return False
-    return not settings.get("entropy_bonus") or isinstance(agent, SAC | TQC)

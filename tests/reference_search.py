@@ -22,8 +22,6 @@ class Reference:
     :param policy: observation -> scaled action ``[act_dim]`` (pi_theta)
     :param critics: observation, scaled action -> one float per critic (Q_phi1, Q_phi2)
     :param gamma: discount factor
-    :param entropy: observation, scaled action -> -alpha log pi(a|s), for soft values: the value of an action
-        does not contain its own entropy, but that of all later ones
     """
 
     def __init__(
@@ -33,10 +31,9 @@ class Reference:
         policy: Callable[[np.ndarray], np.ndarray],
         critics: Callable[[np.ndarray, np.ndarray], list[float]],
         gamma: float,
-        entropy: Callable[[np.ndarray, np.ndarray], float] = lambda observation, action: 0.0,
     ) -> None:
         self.env_step, self.restore = env_step, restore
-        self.policy, self.critics, self.gamma, self.entropy = policy, critics, gamma, entropy
+        self.policy, self.critics, self.gamma = policy, critics, gamma
 
     def choose(
         self, observation, beam_noise: np.ndarray, rollout_noise: np.ndarray
@@ -79,5 +76,4 @@ class Reference:
             if done:
                 return total, seen
             action = clip(self.policy(observation) + noise[d])
-            total += alpha * self.entropy(observation, action)
         return total + alpha * min(self.critics(observation, action)), seen

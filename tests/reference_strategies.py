@@ -136,7 +136,6 @@ class ReferenceTree:
     :param width: nodes that are kept at every depth
     :param branching: children of each
     :param include_policy_action: whether the first child's action is the policy's own
-    :param one_node_per_root: whether only the best node of each root action is kept
     :param hold: environment steps between two depths, with the same noise
     """
 
@@ -146,12 +145,10 @@ class ReferenceTree:
         width: int,
         branching: int,
         include_policy_action: bool = False,
-        one_node_per_root: bool = False,
         hold: int = 1,
     ) -> None:
         self.reference, self.width, self.branching = reference, width, branching
-        self.include_policy_action, self.one_node_per_root = include_policy_action, one_node_per_root
-        self.hold = hold
+        self.include_policy_action, self.hold = include_policy_action, hold
         self.outcome = Outcome()
 
     def choose(self, observation, root_noise: np.ndarray, later_noise: np.ndarray) -> Outcome:
@@ -218,12 +215,6 @@ class ReferenceTree:
         for root in {node.root for node in ranking}:
             self.outcome.values[root] = max(node.score for node in ranking if node.root == root)
         places = sorted(range(len(ranking)), key=lambda i: -ranking[i].score)
-        if self.one_node_per_root:
-            places = [
-                place
-                for rank, place in enumerate(places)
-                if ranking[place].root not in [ranking[better].root for better in places[:rank]]
-            ]
         return [ranking[place] for place in sorted(places[: self.width])]
 
 

@@ -1,10 +1,16 @@
 """Settings that are set as attributes of an agent, or given to ``load``: they hold, or are refused."""
 
+import copy
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from gymnasium.wrappers import TransformReward
+from stable_baselines3 import TD3
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_mcbs import MCBSSAC, MCBSTD3, MCBSTQC, SearchPolicy
 from sb3_mcbs.agents.schedule import ScheduleSettings
@@ -18,14 +24,14 @@ CHANGES = [
     (MCBSTD3, dict(rollout_depth=3, n_simulations=1, beam_noise=0.3, rollout_noise=0.0, noise_clip=0.4)),
     (MCBSTD3, dict(strategy="refine", rollout_depth=3)),
     (MCBSTD3, dict(strategy="tree", branching=2)),
-    (MCBSTD3, dict(include_policy_action=True, antithetic=True, common_noise=True)),
+    (MCBSTD3, dict(include_policy_action=True, antithetic=True)),
     (MCBSTD3, dict(n_threads=2, forward_model="pool", matmul_precision="high")),
     (MCBSTD3, dict(proposal_dims=1, n_proposals=6, noise_hold=2)),
     (MCBSTD3, dict(search_share=0.5, search_unit="episode")),
     (MCBSTD3, dict(search_schedule="saturation", final_search_share=0.1, saturation_window=20)),
     (MCBSTD3, dict(search_schedule="anneal", final_beam_width=1, final_rollout_depth=1)),
-    (MCBSSAC, dict(entropy_bonus=True)),
-    (MCBSTQC, dict(tqc_value="truncated")),
+    (MCBSSAC, dict(strategy="tree", branching=2)),
+    (MCBSTQC, dict(beam_width=5)),
 ]
 
 
@@ -84,8 +90,7 @@ def test_a_callback_may_change_settings_while_training(make_agent, cls, changes)
     untouched = trained(make_agent(cls=cls))
     rows = [each.replay_buffer.actions[:60] for each in (agent, untouched)]
     np.testing.assert_array_equal(rows[0][:40], rows[1][:40])
-    # Untrained critics rate the best candidate highest with and without their highest quantiles.
-    assert np.array_equal(*rows) == ("n_threads" in changes or "tqc_value" in changes)
+    assert np.array_equal(*rows) == ("n_threads" in changes)
 
 
 def test_a_changed_width_holds_from_the_next_decision_on(make_agent):
@@ -121,7 +126,6 @@ def test_wrong_values_are_refused_at_once_and_change_nothing(make_agent, cls):
         ("action_noise_after_search", "yes", TypeError, "action_noise_after_search"),
         ("preset", "quick", ValueError, "There is no preset 'quick'"),
         ("value_expansion", 2, ValueError, "not from or to 0"),
-        ("rollout_replay", 0.5, ValueError, "rollout_replay keeps equally many"),
         ("forward_model", "ensemble", ValueError, "decided when it is made or loaded"),
         ("forward_model", "mujoco", Exception, "environment 0"),
         ("ensemble_size", 1, ValueError, "ensemble_size must be between 2"),
@@ -134,14 +138,11 @@ def test_wrong_values_are_refused_at_once_and_change_nothing(make_agent, cls):
 
 
 def test_what_is_kept_beside_the_replay_buffer_stays_as_it_is(make_agent):
-    agent = make_agent("InvertedPendulum-v5", value_expansion=1, expanded_share=0.5, rollout_replay=0.2)
-    for name, value in (("beam_width", 4), ("n_simulations", 1), ("rollout_depth", 1), ("rollout_replay", 0)):
-        with pytest.raises(ValueError, match="rollout_replay keeps equally many"):
-            setattr(agent, name, value)
+    agent = make_agent("InvertedPendulum-v5", value_expansion=1, expanded_share=0.5)
     with pytest.raises(ValueError, match="not from or to 0"):
         agent.value_expansion = 0
-    agent.value_expansion, agent.expanded_share, agent.rollout_replay = 2, 0.25, 0.5
-    made = make_agent("InvertedPendulum-v5", value_expansion=2, expanded_share=0.25, rollout_replay=0.5)
+    agent.value_expansion, agent.expanded_share = 2, 0.25
+    made = make_agent("InvertedPendulum-v5", value_expansion=2, expanded_share=0.25)
     assert_same_training(trained(agent), trained(made))
 
 
@@ -250,3 +251,113 @@ def test_what_a_search_policy_does_not_follow_is_refused(make_agent):
     policy.predict(agent.get_env().reset())
     policy.gamma = 0.5
     assert agent.gamma == 0.5, "attributes of the agent are set where they are read"
+
+
+def test_a_shallow_copy_has_settings_of_its_own(make_agent):
+    agent = make_agent()
+    other = copy.copy(agent)
+    other.beam_width, other.search_share = 5, 0.0
+    assert (agent.beam_width, agent.search_share) == (3, 1.0) and other.policy is agent.policy
+    agent.learn(30)
+    assert agent.n_simulated_steps == 10 * (3 + 3 * 2)
+    policy = SearchPolicy(agent, agent.get_env(), seed=0)
+    other = copy.copy(policy)
+    other.beam_width = 7
+    for each, width in ((policy, 3), (other, 7)):
+        each.predict(agent.get_env().reset())
+        assert each.last_result.values.shape[1] == each.beam_width == width
+
+
+def test_noise_that_is_not_there_is_missed_at_once(make_agent):
+    agent = make_agent()
+    with pytest.raises(ValueError, match="there is none: pass an action_noise"):
+        agent.learn(40, callback=SetsAttributes(30, dict(action_noise_after_search=True)))
+    noise = NormalActionNoise(np.zeros(1), np.full(1, 0.1))
+    agent = make_agent(search_share=0.0, action_noise=noise, gradient_steps=0, train_freq=1000)
+    agent.learn(60, callback=SetsAttributes(30, dict(action_noise=None)))
+    observations, actions = agent.replay_buffer.observations[31:60, 0], agent.replay_buffer.actions[31:60, 0]
+    assert (actions - agent.policy.scale_action(agent.predict(observations)[0])).std() > 0.02
+
+
+def test_rewards_are_scaled_as_the_critics_learn_them(make_agent):
+    env = VecNormalize(make_vec_env("Pendulum-v1", 1, seed=0))
+    agent = make_agent(env).learn(40)
+    rewards = np.array([-1.0])
+    for normalize in (False, True):
+        env.norm_reward = normalize
+        agent.learn(2, reset_num_timesteps=False)
+        assert (agent._searcher.view.scale_reward(rewards) == rewards).all() != normalize
+
+
+def test_what_was_noticed_of_the_environment_is_not_forgotten(make_agent):
+    agent = make_agent().learn(25)
+    agent._searcher.model.deterministic = False
+    agent.n_threads = 2
+    assert not agent._searcher.model.deterministic
+    agent.beam_width = 4
+    assert not agent._searcher.model.deterministic
+
+
+def test_an_environment_that_cannot_be_searched_in_leaves_the_old_one(make_agent):
+    agent = make_agent("InvertedPendulum-v5", forward_model="mujoco").learn(30)
+    before = agent.get_env()
+    with pytest.raises(ValueError, match="spaces do not match"):
+        agent.set_env(make_vec_env("Pendulum-v1", 1))
+    other = make_vec_env(
+        "InvertedPendulum-v5", 1, wrapper_class=TransformReward, wrapper_kwargs=dict(func=abs)
+    )
+    with pytest.raises(Exception, match="environment 0"):
+        agent.set_env(other)
+    assert agent.get_env() is before
+    agent.learn(10, reset_num_timesteps=False)
+    assert agent.n_decisions == 20
+
+
+def test_a_copy_without_environments_takes_settings(make_agent):
+    agent = make_agent(VecNormalize(make_vec_env("Pendulum-v1", 1, seed=0)), strategy="refine").learn(30)
+    other = copy.deepcopy(agent)
+    other.beam_width, other.rollout_depth, other.search_share = 7, 3, 0.5
+    other.set_env(VecNormalize(make_vec_env("Pendulum-v1", 1, seed=0)))
+    assert other.learn(30).search_settings == replace(agent.search_settings, beam_width=7, rollout_depth=3)
+
+
+def test_value_expansion_refuses_another_simulator_at_once(make_agent):
+    agent = make_agent("InvertedPendulum-v5", value_expansion=1)
+    with pytest.raises(Exception, match="needs batched MuJoCo"):
+        agent.forward_model = "pool"
+    agent.learn(40)
+
+
+def test_a_preset_among_custom_objects(make_agent, tmp_path):
+    make_agent().save(tmp_path / "agent")
+    loaded = MCBSTD3.load(tmp_path / "agent", device="cpu", custom_objects={"preset": "strong"})
+    assert loaded.search_settings == SearchSettings.preset("strong", n_threads=1)
+
+
+def test_a_search_policy_says_what_is_not_its_own(make_agent):
+    plain = make_agent(cls=TD3)
+    policy = SearchPolicy(plain, plain.get_env(), seed=0)
+    with pytest.raises(AttributeError, match="search_share is for agents that search while they train"):
+        policy.search_share = 0.5
+    policy.preset = "efficient"
+    policy.preset = "balanced"
+    assert policy.preset == "balanced" and policy.settings == SearchSettings.preset("balanced")
+
+
+class Doubling(MCBSTD3):
+    """A user's class that has made a property of a setting."""
+
+    @property
+    def beam_width(self):
+        return 2 * self._half_width
+
+    @beam_width.setter
+    def beam_width(self, width):
+        self._half_width = width
+
+
+def test_a_property_of_a_class_of_the_users_is_asked(make_agent):
+    agent = make_agent(cls=Doubling)
+    agent.beam_width = 4
+    agent.learn(30)
+    assert agent.n_simulated_steps == 10 * (8 + 8 * 2)

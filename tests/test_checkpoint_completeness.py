@@ -142,11 +142,33 @@ def test_the_runs_parts_are_not_skipped_by_their_own_list(tmp_path):
     ) == set()
 
 
-@pytest.mark.parametrize("value", [open, lambda: None, Probe], ids=["compiled", "lambda", "class"])
-def test_functions_and_classes_are_found_again_by_name(value, tmp_path):
-    agent, probe = maker(SAC)(tmp_path), Probe()
-    probe.function = value
-    learn(agent, tmp_path, 50, more=[probe])
+class Chooser(BaseCallback):
+    """Holds a function or a class: from step 30 on another one than before."""
+
+    not_checkpointed = ("then",)
+
+    def __init__(self, first, then) -> None:
+        super().__init__()
+        self.held, self.then = [first], then
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps == 30:
+            self.held = [self.then]
+        return True
+
+
+@pytest.mark.parametrize(
+    ("first", "then"),
+    [(print, open), (lambda: 1, lambda: 2), (SAC, Probe)],
+    ids=["compiled", "lambda", "class"],
+)
+def test_functions_and_classes_are_found_again_by_name(first, then, tmp_path):
+    crash(maker(SAC), tmp_path, 90, 65, lambda folder: [Chooser(first, then)])
+    agent = resume(tmp_path / "checkpoints", make_env(tmp_path), classes=[then])
+    chooser = Chooser(first, None)
+    learn(agent, tmp_path, 90, more=[chooser])
+    assert agent.num_timesteps == 90 and len(chooser.held) == 1
+    assert chooser.held[0] is then
 
 
 def test_what_cannot_be_written_is_named_before_training(tmp_path):

@@ -373,10 +373,10 @@ def test_a_registered_pair_of_functions():
 
 
 def test_ordered_dictionaries_are_the_only_calls():
-    from sb3_mcbs.checkpoints.kinds import kind_of
-    from sb3_mcbs.snapshot.graph import Freezer
+    from sb3_mcbs.checkpoints.handlers import handler_of
+    from sb3_mcbs.snapshot.object_graph import Freezer
 
-    freezer = Freezer(kind_of, {}, 0)
+    freezer = Freezer(handler_of, {}, 0)
     freezer.freeze(OrderedDict(a=1))
     Encoder().encode_nodes(tuple(freezer.nodes))
     with pytest.raises(SnapshotUnsupportedError, match="range_iterator cannot be written as data"):

@@ -74,9 +74,7 @@ RUNS = {
     ),
     "MCBSTD3, pool": maker(MCBSTD3, forward_model="pool"),
     "MCBSTD3, MuJoCo": maker(MCBSTD3, "InvertedPendulum-v5"),
-    "MCBSTD3, rollout replay and value expansion": maker(
-        MCBSTD3, "InvertedPendulum-v5", n_envs=2, rollout_replay=0.25, value_expansion=2
-    ),
+    "MCBSTD3, value expansion": maker(MCBSTD3, "InvertedPendulum-v5", n_envs=2, value_expansion=2),
     "MCBSTD3, saturation by episodes": maker(
         MCBSTD3,
         "InvertedPendulum-v5",
@@ -88,12 +86,10 @@ RUNS = {
     "MCBSTD3, few directions": maker(MCBSTD3, "Hopper-v5", proposal_dims=2, noise_hold=2),
     "MCBSDDPG": maker(MCBSDDPG),
     "MCBSDDPG, refinement of a preset": maker(MCBSDDPG, preset="balanced"),
-    "MCBSSAC, soft values": maker(MCBSSAC, entropy_bonus=True),
+    "MCBSSAC": maker(MCBSSAC),
     "MCBSSAC, gSDE": maker(MCBSSAC, use_sde=True, use_sde_at_warmup=True),
     "MCBSTQC": maker(MCBSTQC),
-    "MCBSTQC, soft and truncated values, MuJoCo": maker(
-        MCBSTQC, "InvertedPendulum-v5", entropy_bonus=True, tqc_value="truncated", ent_coef=0.1
-    ),
+    "MCBSTQC, fixed entropy, MuJoCo": maker(MCBSTQC, "InvertedPendulum-v5", ent_coef=0.1),
     "TD3, Ornstein-Uhlenbeck, two environments": maker(TD3, n_envs=2, action_noise=OU_NOISE),
     "TD3, whole episodes": maker(TD3, "InvertedPendulum-v5", train_freq=(1, "episode"), gradient_steps=-1),
     "DDPG, large buffer": maker(DDPG, buffer_size=1000),

@@ -57,25 +57,23 @@ def test_a_copy_goes_on_as_the_original_does(make_agent, cls, make_copy):
     assert other._searcher.environments.wrappers[0] is other.env.envs[0] is not original.env.envs[0]
 
 
-KINDS = {
+HANDLERS = {
     "batched MuJoCo": dict(env="HalfCheetah-v5"),
     "copies of MuJoCo": dict(env="InvertedPendulum-v5", forward_model="pool"),
     "two environments": dict(env=lambda: snapshot_vec_env("Pendulum-v1", 2)),
     "efficient": dict(preset="efficient"),
     "value expansion": dict(env="Hopper-v5", value_expansion=2),
     "value expansion of SAC": dict(env="Hopper-v5", value_expansion=2, cls=MCBSSAC),
-    "rollout replay": dict(rollout_replay=0.5),
     "plans": dict(strategy="refine", n_rounds=2),
-    "entropy": dict(cls=MCBSSAC, entropy_bonus=True),
     "directions": dict(env="HalfCheetah-v5", proposal_dims=2),
     "no simulation": dict(rollout_depth=0),
     "half of the steps": dict(search_share=0.5),
 }
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", HANDLERS)
 def test_every_kind_of_search_goes_on(make_agent, kind):
-    settings = dict(KINDS[kind])
+    settings = dict(HANDLERS[kind])
     env = settings.get("env", "Pendulum-v1")
     original = make_agent(**{**settings, "env": env() if callable(env) else env}).learn(44)
     other = COPIES["pickle"](original)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sb3_mcbs import MCBSTD3, SearchPolicy, SearchSettings
-from sb3_mcbs.search import Agent, Pace, beam_search, deadline_search
+from sb3_mcbs.search import Agent, LatencyForecast, beam_search, deadline_search
 from sb3_mcbs.search.beam import Noise
 from tests.conftest import snapshot_vec_env
 from tests.fake_model import LineWorld
@@ -57,7 +57,7 @@ def decide(world, pace, budget, seed=0, n_envs=1, **changes):
 
 def test_rounds_are_added_while_there_is_time():
     clock = Clock()
-    world, pace = SlowWorld(clock), Pace(clock)
+    world, pace = SlowWorld(clock), LatencyForecast(clock)
     assert decide(world, pace, 0.5).rounds == 1, "the first decision knows nothing yet, and is late"
     for _ in range(100):
         decide(world, pace, 5.0)
@@ -69,7 +69,7 @@ def test_rounds_are_added_while_there_is_time():
 
 def test_the_best_of_all_rounds_is_chosen_and_matches_one_beam():
     clock = Clock()
-    world, pace = SlowWorld(clock), Pace(clock)
+    world, pace = SlowWorld(clock), LatencyForecast(clock)
     for _ in range(3):
         decide(world, pace, 40.0, n_envs=3)
     result = decide(world, pace, 40.0, seed=3, n_envs=3)
@@ -95,7 +95,7 @@ def test_the_best_of_all_rounds_is_chosen_and_matches_one_beam():
 
 def test_unfinished_rounds_do_not_count():
     clock = Clock()
-    world, pace = SlowWorld(clock), Pace(clock)
+    world, pace = SlowWorld(clock), LatencyForecast(clock)
     result = decide(world, pace, 1.5, rollout_depth=5)
     assert result.rounds == 0 and result.chosen[0] == -1 and result.first_step is None
     assert result.actions[0] == 0.0, "the policy's own action"
@@ -108,20 +108,34 @@ def test_unfinished_rounds_do_not_count():
     assert decide(world, pace, 5.5, rollout_depth=5).rounds == 1
 
 
+def rounds_of(world, pace, n_decisions):
+    """How many rounds decisions do that want one candidate within a second."""
+    return [decide(world, pace, 1.0, beam_width=1).rounds for _ in range(n_decisions)]
+
+
 def test_one_hiccup_does_not_end_searching():
     clock = Clock()
-    world, pace = SlowWorld(clock, seconds_per_row=0.1), Pace(clock)
-    decide(world, pace, 1.0)
-    world.seconds_per_row = 10.0
-    assert decide(world, pace, 1.0).rounds == 0 or clock.now > 10
+    world, pace = SlowWorld(clock, seconds_per_row=0.1), LatencyForecast(clock)
+    assert rounds_of(world, pace, 40) == [1] * 40
+    start, world.seconds_per_row = clock.now, 10.0
+    assert rounds_of(world, pace, 1) == [1]
+    assert clock.now - start == 10.0, "late, and known to be"
     world.seconds_per_row = 0.1
-    results = [decide(world, pace, 1.0) for _ in range(400)]
-    assert all(result.rounds > 0 for result in results[-100:])
+    assert rounds_of(world, pace, 60) == [1] * 60
+
+
+def test_searching_begins_again_when_the_machine_is_quick_again():
+    clock = Clock()
+    world, pace = SlowWorld(clock, seconds_per_row=2.0), LatencyForecast(clock)
+    assert rounds_of(world, pace, 20)[-5:] == [0] * 5, "no round is expected to end in time"
+    world.seconds_per_row = 0.1
+    results = rounds_of(world, pace, 400)
+    assert results[0] == 0 and results[-100:] == [1] * 100
 
 
 def test_more_candidates_than_the_beam_if_wanted():
     clock = Clock()
-    world, pace = SlowWorld(clock), Pace(clock)
+    world, pace = SlowWorld(clock), LatencyForecast(clock)
     for _ in range(4):
         result = decide(world, pace, 100.0, max_beam_width=30)
     assert result.values.shape[1] == 30
@@ -129,7 +143,7 @@ def test_more_candidates_than_the_beam_if_wanted():
 
 def test_the_policys_action_is_among_the_candidates_once():
     clock = Clock()
-    world, pace = SlowWorld(clock), Pace(clock)
+    world, pace = SlowWorld(clock), LatencyForecast(clock)
     for _ in range(3):
         result = decide(world, pace, 12.0, include_policy_action=True)
     assert result.rounds > 1
@@ -137,7 +151,7 @@ def test_the_policys_action_is_among_the_candidates_once():
 
 
 def test_wide_rounds_leave_half_of_the_time():
-    pace = Pace(Clock())
+    pace = LatencyForecast(Clock())
     for width in 10 * (1, 2, 4, 8):
         pace.note_round(width, float(width))
     assert pace.affordable(7.0, 100) == 2
@@ -185,7 +199,7 @@ def test_an_agent_trains_and_acts_with_a_budget(make_agent, tmp_path):
 
 def test_the_critics_answers_are_counted():
     clock = Clock()
-    world, pace = SlowWorld(clock), Pace(clock)
+    world, pace = SlowWorld(clock), LatencyForecast(clock)
     for _ in range(3):
         result = decide(world, pace, 40.0)
     assert result.critic_evaluations == 8 == result.values.size

@@ -5,17 +5,16 @@ import pytest
 
 from sb3_mcbs import MCBSTD3, SearchPolicy, SearchSettings
 from sb3_mcbs.agents.planner import Searcher
-from sb3_mcbs.agents.rollout_replay import RolloutReplaySettings
 from sb3_mcbs.search import (
     Decision,
-    PlanMemory,
     RecentActions,
+    WarmStart,
     beam_search,
     deadline_search,
     draw_noise,
     search,
 )
-from sb3_mcbs.search.deadline import Pace
+from sb3_mcbs.search.deadline import LatencyForecast
 from sb3_mcbs.search.directions import ENOUGH, RECENT, low_dimensional
 from sb3_mcbs.search.refine import draw_plan_noise, first_spread, refine_search
 from sb3_mcbs.search.tree import draw_tree_noise, tree_search
@@ -33,13 +32,13 @@ BEAMS = [
     dict(beam_width=4, rollout_depth=1, noise_hold=3, n_simulations=3),
     dict(beam_width=5, rollout_depth=2, noise_hold=2, n_simulations=1, include_policy_action=True),
     dict(beam_width=3, rollout_depth=3, noise_hold=2, n_simulations=3, antithetic=True),
-    dict(beam_width=3, rollout_depth=2, noise_hold=3, n_simulations=2, common_noise=True),
+    dict(beam_width=3, rollout_depth=2, noise_hold=3, n_simulations=2),
     dict(beam_width=4, rollout_depth=2, noise_hold=4, n_simulations=5, rollout_noise=0.0, noise_clip=0.4),
 ]
 TREES = [
     dict(beam_width=3, branching=2, rollout_depth=3, noise_hold=2),
     dict(beam_width=2, branching=3, rollout_depth=2, noise_hold=4, include_policy_action=True),
-    dict(beam_width=3, branching=2, rollout_depth=3, noise_hold=2, n_proposals=15, one_node_per_root=True),
+    dict(beam_width=3, branching=2, rollout_depth=3, noise_hold=2, n_proposals=15),
 ]
 REFINEMENTS = [
     dict(beam_width=4, n_rounds=3, rollout_depth=2, noise_hold=2, n_elites=2),
@@ -53,7 +52,7 @@ worlds = pytest.mark.parametrize("world", WORLDS.values(), ids=WORLDS)
 
 def tree_of(reference, settings) -> ReferenceTree:
     sizes = settings.beam_width, settings.branching, settings.include_policy_action
-    return ReferenceTree(reference, *sizes, settings.one_node_per_root, settings.noise_hold)
+    return ReferenceTree(reference, *sizes, settings.noise_hold)
 
 
 def refinement_of(reference, settings, directions=None) -> ReferenceRefine:
@@ -70,7 +69,7 @@ def test_a_beam_that_holds_noise_equals_the_reference(changes, world, determinis
     model.deterministic = deterministic
     rng = np.random.default_rng(0)
     noise = draw_noise(rng, settings, len(ROOTS), 1)
-    result = beam_search(model, ROOTS, OBSERVATIONS, AGENT, settings, noise, rng, record=True)
+    result = beam_search(model, ROOTS, OBSERVATIONS, AGENT, settings, noise, rng)
     distinct = settings.distinct_simulations(deterministic)
     steps = 0
     for env, root in enumerate(ROOTS):
@@ -80,10 +79,6 @@ def test_a_beam_that_holds_noise_equals_the_reference(changes, world, determinis
         assert_agree(result, env, outcome)
         steps += outcome.steps
     assert result.simulated_steps == model.steps_taken == steps
-    lengths = result.rollouts.lengths
-    assert lengths.shape == (len(ROOTS), settings.beam_width * distinct) and lengths.max() <= settings.horizon
-    first = result.rollouts.rewards[:, :, 0].reshape(len(ROOTS), -1, distinct)
-    assert (first == first[:, :, :1]).all()
 
 
 def sizes_of(settings) -> tuple[int, int, bool]:
@@ -138,10 +133,10 @@ EVERY = [
 def test_simulated_steps_are_known_beforehand(changes, spread):
     settings = SearchSettings(**{"n_simulations": 2, "beam_noise": 0.4, **changes})
     model = LineWorld(spread=spread)
-    memory = PlanMemory(len(ROOTS), settings.horizon, 1)
+    memory = WarmStart(len(ROOTS), settings.horizon, 1)
     rng, envs = np.random.default_rng(0), range(len(ROOTS))
     decision = Decision(model, ROOTS, OBSERVATIONS, AGENT, settings, (len(ROOTS), 1), rng)
-    result = search(decision._replace(memory=memory, envs=envs, moments=[(1, 0)] * len(ROOTS)))
+    result = search(decision._replace(memory=memory, envs=envs, clocks=[(1, 0)] * len(ROOTS)))
     expected = len(ROOTS) * settings.simulated_steps(deterministic=spread == 0)
     assert result.simulated_steps == model.steps_taken == expected
 
@@ -149,7 +144,7 @@ def test_simulated_steps_are_known_beforehand(changes, spread):
 def test_what_is_left_of_a_plan_is_the_mean_of_what_it_held():
     """Macro-steps begin anew at every decision, so those of the last plan lie across them."""
     settings = SearchSettings(8, 2, strategy="refine", beam_noise=0.3, noise_hold=2)
-    memory, rng, x = PlanMemory(1, 4, 1), np.random.default_rng(0), np.array([[1.0]])
+    memory, rng, x = WarmStart(1, 4, 1), np.random.default_rng(0), np.array([[1.0]])
     memory.keep(np.float32([[[0.1], [0.1], [0.4], [0.4]]]), [0], [(1, 0)])
     for moment, expected in (((1, 0), 0.1), ((1, 1), 0.25), ((1, 2), 0.4), ((1, 3), 0.2), ((2, 0), 0.0)):
         before = memory.state([moment])
@@ -266,7 +261,7 @@ def test_a_deadline_searches_in_the_directions_and_holds_noise():
     settings = SearchSettings(
         4, 2, 2, time_budget=10, noise_hold=3, include_policy_action=True, proposal_dims=1
     )
-    model, pace, rng = LineWorld(), Pace(), np.random.default_rng(0)
+    model, pace, rng = LineWorld(), LatencyForecast(), np.random.default_rng(0)
     deadline = pace.clock() + 10
     result = deadline_search(
         model, ROOTS, OBSERVATIONS, AGENT, settings, deadline, pace, rng, np.float32([[0.0]])
@@ -288,11 +283,6 @@ REFUSED = [
 def test_what_makes_no_sense_is_refused(changes, words):
     with pytest.raises(ValueError, match=words):
         SearchSettings(**changes)
-
-
-def test_rollouts_that_hold_noise_are_not_learned_from():
-    with pytest.raises(ValueError, match="noise_hold=1"):
-        RolloutReplaySettings(0.5).check_search(SearchSettings(noise_hold=2))
 
 
 TRAINED = dict(strategy="refine", beam_width=4, rollout_depth=2, n_rounds=1, noise_hold=2, n_simulations=1,

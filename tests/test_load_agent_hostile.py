@@ -114,38 +114,6 @@ def test_other_members_are_not_opened(saved, tmp_path, member):
     assert flag.exists()
 
 
-def test_a_pickle_for_an_entropy_coefficient_does_not_run(saved, tmp_path, monkeypatch):
-    monkeypatch.setenv("TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD", "1")
-    _, path = saved(SAC)
-    content = pickle.dumps(files.Payload(tmp_path / "flag"), 2)
-    strange = files.write(tmp_path / "s.zip", {**files.members_of(path), "pytorch_variables.pth": content})
-    with pytest.raises(AgentFileError, match=r"s\.zip: 'pytorch_variables\.pth' cannot be read"):
-        load(strange)
-    assert not (tmp_path / "flag").exists()
-
-
-@pytest.mark.parametrize(
-    "variables",
-    [
-        {"log_ent_coef": th.zeros(2)},
-        {"log_ent_coef": th.tensor(0.0)},
-        {"log_ent_coef": th.tensor([np.nan])},
-        {"log_ent_coef": th.tensor([1000.0])},
-        {"ent_coef_tensor": th.tensor(-1.0)},
-        {"ent_coef_tensor": th.tensor(1)},
-        {"ent_coef_tensor": "0.1"},
-        ["log_ent_coef"],
-    ],
-)
-def test_what_is_no_entropy_coefficient_is_refused(saved, tmp_path, variables):
-    _, path = saved(SAC)
-    stream = io.BytesIO()
-    th.save(variables, stream)
-    members = {**files.members_of(path), "pytorch_variables.pth": stream.getvalue()}
-    with pytest.raises(AgentFileError, match=r"s\.zip: .*(ent_coef|pytorch_variables)"):
-        load(files.write(tmp_path / "s.zip", members))
-
-
 def test_files_of_rl_zoo_beside_the_agent_are_not_read(saved, tmp_path):
     _, path = saved(SAC)
     flag = tmp_path / "flag"

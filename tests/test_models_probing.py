@@ -276,9 +276,7 @@ def test_time_limits_stop_nothing() -> None:
         assert found.stopped is None and found.goes_on.all()
 
 
-@pytest.mark.parametrize(
-    "settings", [{}, dict(strategy="tree"), dict(preset="balanced"), dict(rollout_replay=0.5)]
-)
+@pytest.mark.parametrize("settings", [{}, dict(strategy="tree"), dict(preset="balanced")])
 def test_agents_learn_where_the_environment_truncates(make_agent, settings) -> None:
     agent = make_agent(Point(last=7), **{"learning_starts": 10, **settings}).learn(60)
     assert agent.n_decisions > 0 and agent.replay_buffer.timeouts.sum() == 8

@@ -86,27 +86,6 @@ def test_pairs_are_of_independent_draws():
     assert drawn.std() == pytest.approx(1.0, rel=0.05)
 
 
-def test_common_noise_is_shared_by_all_candidates():
-    settings = SearchSettings(4, 3, 2, common_noise=True)
-    noise = draw_noise(rng(), settings, 2, 3)
-    assert noise.rollout.shape == (3, 2, 4, 2, 3)
-    assert (noise.rollout == noise.rollout[:, :, :1]).all()
-    assert len(np.unique(noise.rollout)) == 3 * 2 * 2 * 3, "but differs otherwise"
-    assert len(np.unique(noise.beam)) == noise.beam.size
-    settings = SearchSettings(4, 3, 1, common_noise=True, strategy="tree", branching=2)
-    tree = draw_tree_noise(rng(), settings, 2, 3)
-    assert (tree.later == tree.later[:, :, :1]).all()
-    assert len(np.unique(tree.later)) == 2 * 2 * 2 * 3
-
-
-def test_common_noise_makes_equal_candidates_equal():
-    """Two candidates that are the same get the same value, which independent noise does not give them."""
-    for common in (False, True):
-        settings = SearchSettings(2, 3, 2, common_noise=common, rollout_noise=0.3, beam_noise=1e-30)
-        values = search(LineWorld(), [0.5], settings, draw_noise(rng(), settings, 1, 1)).values[0]
-        assert (values[0] == values[1]) == common
-
-
 @pytest.mark.parametrize(
     "changes, words",
     [
@@ -123,20 +102,11 @@ def test_common_noise_makes_equal_candidates_equal():
         (dict(strategy="refine", time_budget=1.0), "strategy='beam' only"),
         (dict(n_proposals=6, time_budget=1.0), "n_proposals"),
         (dict(antithetic=True, time_budget=1.0), "antithetic"),
-        (dict(common_noise=True, time_budget=1.0), "common_noise"),
         (dict(n_proposals=5), "n_proposals must be between 6"),
         (dict(n_proposals=29, strategy="tree"), "n_proposals must be between 30"),
         (dict(n_proposals=31, strategy="tree"), "multiple of beam_width=6"),
         (dict(n_proposals=10, rollout_depth=0), "n_proposals needs a rollout_depth"),
-        (dict(common_noise=True, rollout_noise=0.0), "leave it out"),
-        (dict(common_noise=True, rollout_depth=0), "leave it out"),
-        (dict(common_noise=True, rollout_depth=1, strategy="tree"), "leave it out"),
-        (dict(common_noise=True, strategy="refine"), "no meaning"),
         (dict(n_rounds=0), "n_rounds"),
-        (dict(entropy_bonus=True, rollout_depth=0), "entropy_bonus needs a rollout_depth of 1"),
-        (dict(entropy_bonus=True, strategy="tree"), "entropy_bonus works with strategy='beam' only"),
-        (dict(entropy_bonus=True, strategy="refine"), "entropy_bonus works with strategy='beam' only"),
-        (dict(tqc_value="median"), "tqc_value must be one of"),
         (dict(n_elites=7), "n_elites must be between 1 and 6"),
         (dict(strategy="refine", min_noise=0.0), "n_elites of 2 or more"),
         (dict(beam_noise=0.0), "beam_width above 1 needs a beam_noise"),
@@ -151,7 +121,7 @@ def test_senseless_combinations_are_refused(changes, words):
         SearchSettings(**changes)
 
 
-@pytest.mark.parametrize("name", ["common_noise", "antithetic", "one_node_per_root", "entropy_bonus"])
+@pytest.mark.parametrize("name", ["include_policy_action", "antithetic"])
 def test_switches_are_booleans(name):
     with pytest.raises(TypeError, match=f"{name} must be True or False"):
         SearchSettings(**{name: 1})

@@ -178,12 +178,11 @@ class NotesRandomness(BaseCallback):
 
 
 @pytest.mark.parametrize("cls", [MCBSSAC, MCBSTQC])
-@pytest.mark.parametrize("entropy_bonus", [False, True])
-def test_searching_leaves_gsdes_resampling_as_it_is(make_agent, cls, entropy_bonus):
+def test_searching_leaves_gsdes_resampling_as_it_is(make_agent, cls):
     """The matrices are those of the agent without search, step by step, and so is all later randomness."""
     noted = []
-    for which, search in ((WITHOUT_SEARCH[cls], {}), (cls, dict(entropy_bonus=entropy_bonus))):
-        agent = make_agent(cls=which, learning_rate=0.0, **GSDE, **search)
+    for which in (WITHOUT_SEARCH[cls], cls):
+        agent = make_agent(cls=which, learning_rate=0.0, **GSDE)
         noted.append(NotesRandomness())
         agent.learn(60, callback=noted[-1])
     plain, searching = noted

@@ -9,7 +9,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 from sb3_mcbs import MCBSSAC, MCBSTD3, MCBSTQC
 from sb3_mcbs.agents.schedule import ScheduleSettings, SearchSchedule
 from sb3_mcbs.search import SearchSettings, draw_noise
-from sb3_mcbs.search.streams import stream
+from sb3_mcbs.search.random_streams import spawn_rng
 from tests.checkpoint_helpers import assert_resumed_is_exact
 from tests.conftest import SEARCHING, WITHOUT_SEARCH, assert_same_parameters, snapshot_vec_env
 
@@ -151,10 +151,10 @@ def test_anneals():
     )
     schedule, search = SearchSchedule(settings, 0), SearchSettings(10, 3)
     assert [round(schedule.share(p), 3) for p in (0.0, 0.5, 1.0)] == [1.0, 0.6, 0.2]
-    efforts = [schedule.effort(search, p) for p in (0.0, 0.5, 1.0)]
+    efforts = [schedule.settings_at(search, p) for p in (0.0, 0.5, 1.0)]
     assert [(e.beam_width, e.rollout_depth) for e in efforts] == [(10, 3), (6, 4), (2, 5)]
     constant = SearchSchedule(ScheduleSettings(search_share=0.4), 0)
-    assert constant.share(0.9) == 0.4 and constant.effort(search, 0.9) is search
+    assert constant.share(0.9) == 0.4 and constant.settings_at(search, 0.9) is search
 
 
 @pytest.mark.parametrize(
@@ -340,14 +340,13 @@ def test_a_rollout_beyond_the_end_of_the_training_stays_at_the_end_of_the_anneal
         search_schedule="anneal",
         beam_width=widths[0],
         final_beam_width=widths[1],
-        final_search_share=0.0,
-        rollout_replay=0.25,
+        final_search_share=0.5,
         train_freq=(1, "episode"),
     )
     agent.learn(250)
     assert agent.num_timesteps == 400
     logged = agent.logger.name_to_value
-    assert (logged["search/frequency"], logged["search/beam_width"]) == (0.0, widths[1])
+    assert (logged["search/frequency"], logged["search/beam_width"]) == (0.5, widths[1])
 
 
 def test_a_second_training_begins_at_the_beginning_of_the_anneal(make_agent):
@@ -360,8 +359,8 @@ def test_a_second_training_begins_at_the_beginning_of_the_anneal(make_agent):
 
 def test_generators_have_nothing_in_common(make_agent):
     """A schedule that draws what an environment draws would search where the environment is kind."""
-    agent = make_agent(rollout_replay=0.25, seed=7)
-    rngs = [agent.search_rng, agent._schedule.rng, agent.rollout_rng, stream(7, "learned model")]
+    agent = make_agent(seed=7)
+    rngs = [agent.search_rng, agent._schedule.rng, agent.rollout_rng, spawn_rng(7, "learned model")]
     drawn = [tuple(rng.random(3)) for rng in rngs]
     assert len(set(drawn)) == 4
     environment = tuple(np.random.default_rng(7).random(3))
@@ -373,7 +372,7 @@ def test_generators_have_nothing_in_common(make_agent):
 
 @pytest.mark.parametrize("cls", SEARCHING)
 def test_generators_go_on_where_a_saved_agent_left_them(make_agent, tmp_path, cls):
-    agent = make_agent(cls=cls, search_share=0.5, rollout_replay=0.25)
+    agent = make_agent(cls=cls, search_share=0.5)
     agent.learn(60)
     agent.save(tmp_path / "agent")
 

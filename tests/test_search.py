@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sb3_mcbs.search import Agent, Noise, Pace, SearchSettings, beam_search, deadline_search, draw_noise
+from sb3_mcbs.search import Agent, Noise, SearchSettings, beam_search, draw_noise
 from tests.fake_model import LineWorld
 from tests.reference_search import Reference
 
@@ -30,16 +30,7 @@ def search(model, roots, settings, noise, agent=AGENT):
     return beam_search(model, roots, observations, agent, settings, noise, np.random.default_rng(3))
 
 
-def entropy(observation, action):
-    return 0.3 + 0.2 * float(observation[0]) - 0.5 * float(action[0]) ** 2
-
-
-SOFT_AGENT = AGENT._replace(
-    entropy_bonus=lambda observations, actions: 0.3 + 0.2 * observations[:, 0] - 0.5 * actions[:, 0] ** 2
-)
-
-
-def reference_values(model, root, noise, env, **soft):
+def reference_values(model, root, noise, env):
     world = {}
 
     def restore():
@@ -49,12 +40,10 @@ def reference_values(model, root, noise, env, **soft):
         world["x"] += float(action[0])
         observation, reward, distance = np.array([world["x"]]), -(world["x"] ** 2), abs(world["x"])
         if model.stop < distance <= model.limit:  # ends like a termination, but what would follow counts
-            mean = policy(observation)
-            bonus = soft["entropy"](observation, mean) if soft else 0.0
-            reward += GAMMA * (min(critics(observation, mean)) + bonus)
+            reward += GAMMA * min(critics(observation, policy(observation)))
         return observation, reward, distance > min(model.limit, model.stop)
 
-    reference = Reference(env_step, restore, lambda obs: policy(obs), critics, GAMMA, **soft)
+    reference = Reference(env_step, restore, lambda obs: policy(obs), critics, GAMMA)
     return reference.choose(np.array([float(root)]), noise.beam[env], noise.rollout[:, env])
 
 
@@ -70,53 +59,17 @@ LIMITS = {
 
 @pytest.mark.parametrize("world", LIMITS.values(), ids=LIMITS)
 @pytest.mark.parametrize("width, depth, sims", [(1, 1, 1), (6, 3, 5), (4, 1, 3), (3, 7, 2)])
-@pytest.mark.parametrize("agent, soft", [(AGENT, {}), (SOFT_AGENT, dict(entropy=entropy))], ids=["", "soft"])
-def test_equals_the_reference(width, depth, sims, world, agent, soft):
+def test_equals_the_reference(width, depth, sims, world):
     model = LineWorld(**world)
-    settings = SearchSettings(width, depth, sims, beam_noise=0.5, entropy_bonus=bool(soft))
+    settings = SearchSettings(width, depth, sims, beam_noise=0.5)
     roots = [0.3, -1.2, 1.0]
     noise = draw_noise(np.random.default_rng(0), settings, len(roots), 1)
-    result = search(model, roots, settings, noise, agent)
+    result = search(model, roots, settings, noise)
     for env, root in enumerate(roots):
-        chosen, values, _ = reference_values(model, root, noise, env, **soft)
+        chosen, values, _ = reference_values(model, root, noise, env)
         np.testing.assert_allclose(result.values[env], values, rtol=1e-6, atol=1e-7)
         assert result.chosen[env] == chosen
         np.testing.assert_array_equal(result.actions[env], result.candidates[env, chosen])
-
-
-def test_only_later_actions_have_an_entropy():
-    """With entropies of 1 and all else 0 the value is gamma + ... + gamma^D, or none after a termination."""
-    nothing = SOFT_AGENT._replace(
-        value=lambda observations, actions: np.zeros(len(actions)),
-        scale_reward=np.zeros_like,
-        entropy_bonus=lambda observations, actions: np.ones(len(actions)),
-    )
-    settings = SearchSettings(2, 3, 2, entropy_bonus=True)
-    noise = draw_noise(np.random.default_rng(0), settings, 1, 1)
-    endless, ends = (search(LineWorld(limit), [0.5], settings, noise, nothing) for limit in (np.inf, 0.0))
-    np.testing.assert_allclose(endless.values[0], [GAMMA + GAMMA**2 + GAMMA**3] * 2)
-    np.testing.assert_array_equal(ends.values[0], [0.0, 0.0])
-
-
-def test_a_budget_counts_entropies_too():
-    settings = SearchSettings(4, 3, 2, beam_noise=0.5, time_budget=60.0, entropy_bonus=True)
-    pace, observations = Pace(), np.array([[0.5]])
-    result = deadline_search(
-        LineWorld(),
-        [0.5],
-        observations,
-        SOFT_AGENT,
-        settings,
-        pace.clock() + 60,
-        pace,
-        np.random.default_rng(3),
-    )
-    rng, values = np.random.default_rng(3), []
-    for width in (1, 3):  # a first round of one, then all that is left
-        noise = draw_noise(rng, settings, 1, 1, beam_width=width)
-        values += list(reference_values(LineWorld(), 0.5, noise, 0, entropy=entropy)[1])
-    assert result.rounds == 2
-    np.testing.assert_allclose(result.values[0], values, rtol=1e-6, atol=1e-7)
 
 
 def test_several_environments_equal_single_searches():

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from stable_baselines3.common.noise import NormalActionNoise
 
 from sb3_mcbs import MCBSTD3, MCBSTQC, SearchPolicy, SearchSettings, SnapshotEnvWrapper
-from sb3_mcbs.search import Agent, Decision, Pace, PlanMemory, deadline_search, search
+from sb3_mcbs.search import Agent, Decision, LatencyForecast, WarmStart, deadline_search, search
 from tests.conftest import SMALL, snapshot_vec_env
 from tests.fake_model import LineWorld
 
@@ -68,15 +68,11 @@ VALID = {
     "max_beam_width": st.none() | integers(1, 6),
     "strategy": st.sampled_from(["beam", "tree", "refine", np.str_("tree")]),
     "n_proposals": st.none() | integers(1, 30),
-    "common_noise": st.booleans(),
     "antithetic": st.booleans(),
     "branching": integers(1, 3),
-    "one_node_per_root": st.booleans(),
     "n_rounds": integers(1, 3),
     "n_elites": st.none() | integers(1, 5),
     "min_noise": numbers(),
-    "entropy_bonus": st.booleans(),
-    "tqc_value": st.sampled_from(["mean", "truncated"]),
     "noise_hold": integers(1, 3),
     "proposal_dims": st.none() | integers(1, 1),  # actions have one entry here
 }
@@ -123,11 +119,11 @@ def test_settings_are_refused_or_search_a_small_world(kwargs: dict[str, Any]) ->
     )
     rng, roots, observations = np.random.default_rng(0), [0.5, -1.0], np.array([[0.5], [-1.0]])
     if found.time_budget is None:
-        memory = PlanMemory(2, found.horizon, 1)
+        memory = WarmStart(2, found.horizon, 1)
         decision = Decision(LineWorld(), roots, observations, agent, found, (2, 1), rng)
-        result = search(decision._replace(memory=memory, envs=[0, 1], moments=[(0, 0), (0, 0)]))
+        result = search(decision._replace(memory=memory, envs=[0, 1], clocks=[(0, 0), (0, 0)]))
     else:
-        pace = Pace()
+        pace = LatencyForecast()
         deadline = pace.clock() + min(found.time_budget, 0.01)
         result = deadline_search(LineWorld(), roots, observations, agent, found, deadline, pace, rng)
     assert result.actions.shape == (2, 1)

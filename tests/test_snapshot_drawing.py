@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from sb3_mcbs.snapshot import SnapshotEnvWrapper, SnapshotUnsupportedError
-from sb3_mcbs.snapshot.kinds import kind_of
+from sb3_mcbs.snapshot.handlers import handler_of
 from tests.test_snapshot_graph import Small, follow, wrapped
 from tests.test_snapshot_kinds import assert_same_future
 
@@ -223,7 +223,7 @@ def fake(name):
 )  # fmt: skip
 def test_windows_of_other_packages(kind, names):
     for name in names:
-        assert kind_of(fake(name)).name == kind, name
+        assert handler_of(fake(name)).name == kind, name
 
 
 def test_what_is_drawn_in_a_window_is_refused():
@@ -248,3 +248,24 @@ def test_figures_are_no_state():
     assert len(state.nodes) < 10
     env.restore(state)
     assert env.unwrapped.figure is figure and env.clone().unwrapped.line is None
+
+
+class OtherRows(Small):
+    """Rows of these pictures lie farther apart, or less far, than those of a picture that pygame makes."""
+
+    def prepare(self):
+        pygame.font.init()
+        self.bytes = pygame.image.frombuffer(bytearray(i * 7 % 256 for i in range(75)), (5, 5), "RGB")
+        self.text = pygame.font.Font(None, 14).render("Score 0", True, (255, 255, 255))
+
+    def advance(self):
+        self.bytes.set_at((4, 4), ((self.bytes.get_at((4, 4))[0] + 1) % 250, 1, 2))
+        pixels = pygame.surfarray.array3d(self.bytes), pygame.surfarray.array3d(self.text)
+        return float(sum((part * np.arange(part.size).reshape(part.shape)).sum() % 9973 for part in pixels))
+
+
+def test_rows_of_pixels_may_lie_anywhere_in_memory():
+    env, clone = assert_same_future(OtherRows)
+    for name in ("bytes", "text"):
+        pictures = [getattr(each.unwrapped, name) for each in (env, clone)]
+        np.testing.assert_array_equal(*map(pygame.surfarray.array3d, pictures), err_msg=name)

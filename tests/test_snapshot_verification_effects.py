@@ -43,9 +43,11 @@ def test_the_environment_is_where_it_was(name, tmp_path):
     env, other = envs
     before, monitor = generators(), env.env.env
     written, rewards = (tmp_path / "one.monitor.csv").read_text(), [*monitor.rewards]
-    moment, last = env.moment, env.last_observation.copy()
+    moment, last = env.episode_clock, env.last_observation.copy()
     env.verify()
-    assert generators() == before and env.moment == moment and np.array_equal(env.last_observation, last)
+    assert (
+        generators() == before and env.episode_clock == moment and np.array_equal(env.last_observation, last)
+    )
     assert (tmp_path / "one.monitor.csv").read_text() == written and monitor.rewards == rewards
     assert getattr(env.unwrapped, "n_resets", 2) == getattr(other.unwrapped, "n_resets", 2)
     for _ in range(2):
@@ -57,7 +59,7 @@ def test_an_environment_that_nobody_has_reset_yet():
     env = SnapshotEnvWrapper(Walk())
     assert env.verify()
     assert env.unwrapped._np_random is None and env.last_observation is None
-    assert (env.unwrapped.n_resets, env.moment) == (0, (0, 0))
+    assert (env.unwrapped.n_resets, env.episode_clock) == (0, (0, 0))
 
 
 def test_objects_that_others_hold_too_stay_the_same_objects():
@@ -137,7 +139,7 @@ def test_an_environment_that_is_refused_is_reset():
     with pytest.raises(SnapshotUnsupportedError):
         env.verify()
     assert np.array_equal(env.last_observation, first) and np.array_equal(env.unwrapped.x, first)
-    assert env.moment[1] == 0 and env.reset_arguments == {"seed": 3, "options": {"a": 1}}
+    assert env.episode_clock[1] == 0 and env.reset_arguments == {"seed": 3, "options": {"a": 1}}
 
 
 class Drawing(Walk):

@@ -7,7 +7,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_mcbs import MCBSTD3, SearchPolicy, SearchSettings
 from sb3_mcbs.agents.planner import Searcher
-from sb3_mcbs.search import Decision, PlanMemory, check_dynamics, search
+from sb3_mcbs.search import Decision, WarmStart, check_dynamics, search
 from sb3_mcbs.search.refine import draw_plan_noise, first_spread, refine_search
 from sb3_mcbs.search.tree import draw_tree_noise, tree_search
 from tests.conftest import SMALL, snapshot_vec_env
@@ -41,11 +41,11 @@ def line_reference(model: LineWorld, root: float) -> Reference:
 def on_line(model, settings, seed=0, roots=ROOTS, rng=None):
     """Search from points of a line through the one interface."""
     observations = np.asarray(roots, dtype=float)[:, None]
-    memory, moments = PlanMemory(len(roots), settings.rollout_depth, 1), [(1, 0)] * len(roots)
+    memory, clocks = WarmStart(len(roots), settings.rollout_depth, 1), [(1, 0)] * len(roots)
     rng = rng or np.random.default_rng(seed)
     shape = (len(roots), 1)
     envs = range(len(roots))
-    return search(Decision(model, roots, observations, AGENT, settings, shape, rng, memory, envs, moments))
+    return search(Decision(model, roots, observations, AGENT, settings, shape, rng, memory, envs, clocks))
 
 
 def tree_of(reference: Reference, settings: SearchSettings) -> ReferenceTree:
@@ -54,7 +54,6 @@ def tree_of(reference: Reference, settings: SearchSettings) -> ReferenceTree:
         settings.beam_width,
         settings.branching,
         settings.include_policy_action,
-        settings.one_node_per_root,
     )
 
 
@@ -96,9 +95,9 @@ TREES = [
     dict(beam_width=1, branching=1, rollout_depth=1),
     dict(beam_width=3, branching=2, rollout_depth=4),
     dict(beam_width=2, branching=4, rollout_depth=3, include_policy_action=True),
-    dict(beam_width=4, branching=3, rollout_depth=3, one_node_per_root=True),
+    dict(beam_width=4, branching=3, rollout_depth=3),
     dict(beam_width=3, branching=2, rollout_depth=3, rollout_noise=0.2, noise_clip=0.4, n_proposals=15),
-    dict(beam_width=3, branching=3, rollout_depth=3, common_noise=True, antithetic=True),
+    dict(beam_width=3, branching=3, rollout_depth=3, antithetic=True),
     dict(beam_width=2, branching=2, rollout_depth=3, include_policy_action=True, n_proposals=12),
 ]
 REFINEMENTS = [
@@ -206,9 +205,9 @@ def test_real_environments(env_id, kwargs, kind, steps):
 
 EVERY = [
     dict(strategy="beam", rollout_depth=3),
-    dict(strategy="beam", n_proposals=20, common_noise=True, antithetic=True),
+    dict(strategy="beam", n_proposals=20, antithetic=True),
     dict(strategy="tree", branching=3),
-    dict(strategy="tree", branching=2, n_proposals=24, one_node_per_root=True),
+    dict(strategy="tree", branching=2, n_proposals=24),
     dict(strategy="refine"),
     dict(strategy="refine", n_proposals=15, antithetic=True, include_policy_action=True),
 ]
@@ -301,13 +300,6 @@ def test_a_tree_of_proposals_stops_where_every_node_has_terminated(make_agent):
     env.envs[0].last_observation = observation = env.env_method("_get_obs")[0]
     policy.predict(observation[None])
     assert policy.last_result.chosen[0] >= 0 and policy.last_result.simulated_steps == 4
-
-
-def test_one_node_per_root_keeps_as_many_roots_as_nodes():
-    free = SearchSettings(5, 5, strategy="tree", beam_noise=0.5)
-    spread_out = SearchSettings(5, 5, strategy="tree", beam_noise=0.5, one_node_per_root=True)
-    assert (on_line(LineWorld(), free).surviving_roots < 5).all()
-    assert (on_line(LineWorld(), spread_out).surviving_roots == 5).all()
 
 
 def test_refinement_improves_and_keeps_its_spread():

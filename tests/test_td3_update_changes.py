@@ -10,6 +10,7 @@ import torch as th
 from stable_baselines3 import TD3
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.torch_layers import FlattenExtractor
+from stable_baselines3.td3 import td3 as td3_module
 from torch import nn
 from torch.nn.modules import module as torch_module
 from torch.nn.utils import parametrizations, prune
@@ -420,3 +421,12 @@ def test_what_sb3_cannot_train_fails_alike():
         agent.critic.requires_grad_(False)
         with pytest.raises(RuntimeError, match="does not require grad"):
             train(agent)
+
+
+@pytest.mark.parametrize(("owner", "name"), [(th.nn.functional, "mse_loss"), (td3_module, "polyak_update")])
+def test_functions_that_sb3_trains_with_are_called(monkeypatch, owner, name):
+    calls, function = [], getattr(owner, name)
+    monkeypatch.setattr(owner, name, lambda *args, **kwargs: calls.append(name) or function(*args, **kwargs))
+    agent = agent_with_steps(FastTD3)
+    train(agent)
+    assert calls

@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 from sb3_mcbs import MCBSDDPG, MCBSSAC, MCBSTD3, MCBSTQC
 from sb3_mcbs.agents.value_expansion import ValueExpansion
 from sb3_mcbs.models import ForwardModelError
-from sb3_mcbs.networks.functions import entropy_function, policy_function, soft_policy_function
+from sb3_mcbs.networks.functions import policy_function, soft_policy_function
 from tests.conftest import snapshot_vec_env
 
 AGENTS = [MCBSTD3, MCBSDDPG, MCBSSAC, MCBSTQC]
@@ -54,13 +54,22 @@ def trained(make_agent, env_id="Hopper-v5", n_envs=2, cls=MCBSTD3, env=None, **s
     return agent, snapshots.taken
 
 
+def entropy(agent, observations, actions):
+    """What actions add to the value, ``-ent_coef * log pi(a|s)``, as SB3 computes it."""
+    with th.no_grad():
+        mean, log_std, more = agent.actor.get_action_dist_params(th.as_tensor(observations))
+        distribution = agent.actor.action_dist.proba_distribution(mean, log_std, **more)
+        learned = agent.log_ent_coef is not None
+        coefficient = agent.log_ent_coef.exp() if learned else agent.ent_coef_tensor
+        return (-coefficient * distribution.log_prob(th.as_tensor(actions))).numpy()
+
+
 def go_on(agent, env, snapshot, reward, next_observation):
     """The return of a transition that goes on with the target actor, by the environment's own step.
 
     :return: return, how many steps, whether it terminated, last observation.
     """
     policy, normalizer = policy_function(agent, target=True), agent.get_vec_normalize_env()
-    entropy = entropy_function(agent) if isinstance(agent, MCBSSAC) else lambda observation, action: [0.0]
 
     def seen(observation):
         observation = np.asarray(observation)[None]
@@ -73,7 +82,7 @@ def go_on(agent, env, snapshot, reward, next_observation):
     total, observation, terminated = scaled(reward), next_observation, False
     for length in range(1, STEPS + 1):
         scaled_action = policy(seen(observation))
-        bonus = entropy(seen(observation), scaled_action)[0]
+        bonus = entropy(agent, seen(observation), scaled_action)[0] if isinstance(agent, MCBSSAC) else 0.0
         observation, reward, terminated, _, _ = env.step(agent.policy.unscale_action(scaled_action)[0])
         total += GAMMA**length * (scaled(reward) + bonus)
         if terminated:
@@ -92,17 +101,17 @@ def test_samples_are_those_of_a_plain_loop(make_agent, env_id, cls, normalized):
     expansion = ValueExpansion(agent, agent._searcher)
     before = agent.n_simulated_steps
     sample = expansion.sample(len(rows), GAMMA, FixedRows(rows, envs), agent.get_vec_normalize_env())
-    simulated, n_terminated = 0, 0
+    simulated, n_terminated, n_ended = 0, 0, 0
     for index, (row, number) in enumerate(zip(rows, envs, strict=True)):
         reward, last = buffer.rewards[row, number], buffer.next_observations[row, number]
-        if buffer.dones[row, number]:
-            expected = None
-            assert sample.discounts[index] == pytest.approx(GAMMA)
-            assert sample.dones[index] == 1 - buffer.timeouts[row, number]
-            continue
-        expected, length, terminated, last = go_on(agent, env, taken[row][number], reward, last)
-        simulated += length - 1
-        n_terminated += terminated
+        if buffer.dones[row, number]:  # nothing follows
+            expected = reward if not normalized else vec_env.normalize_reward(reward)
+            length, terminated = 1, not buffer.timeouts[row, number]
+            n_ended += 1
+        else:
+            expected, length, terminated, last = go_on(agent, env, taken[row][number], reward, last)
+            simulated += length - 1
+            n_terminated += terminated
         assert sample.rewards[index].item() == pytest.approx(expected, rel=1e-4, abs=1e-4)
         assert sample.discounts[index].item() == pytest.approx(GAMMA**length)
         assert sample.dones[index].item() == terminated
@@ -110,7 +119,8 @@ def test_samples_are_those_of_a_plain_loop(make_agent, env_id, cls, normalized):
         np.testing.assert_allclose(sample.next_observations[index], seen, rtol=1e-4, atol=1e-5)
     np.testing.assert_array_equal(sample.actions, buffer.actions[rows, envs])
     assert agent.n_simulated_steps - before == simulated
-    assert (n_terminated > 0) == (env_id == "Hopper-v5"), "terminations are covered where there are any"
+    for number in (n_terminated, n_ended):
+        assert (number > 0) == (env_id == "Hopper-v5"), "terminations are covered where there are any"
 
 
 @pytest.mark.parametrize("cls", AGENTS)
@@ -126,10 +136,10 @@ def test_agents_learn_from_both_parts(make_agent, cls, monkeypatch):
     assert set(sizes) == {8} and agent._n_updates == len(sizes)
 
 
-def test_with_rollout_replay_and_worker_processes(make_agent):
+def test_with_worker_processes(make_agent):
     env = snapshot_vec_env("Hopper-v5", 2, vec_env_cls=SubprocVecEnv)
-    agent, _ = trained(make_agent, env=env, rollout_replay=0.5, expanded_share=0.5)
-    assert agent.replay_buffer.expansion_held.any() and agent._rollouts is not None
+    agent, _ = trained(make_agent, env=env, expanded_share=0.5)
+    assert agent.replay_buffer.expansion_held.any()
     env.close()
 
 
@@ -161,7 +171,6 @@ def test_states_are_saved_with_the_replay_buffer(make_agent, tmp_path):
         (dict(value_expansion=1.5), TypeError, "value_expansion"),
         (dict(value_expansion=1, expanded_share=0.0), ValueError, "expanded_share above 0"),
         (dict(value_expansion=1, rollout_depth=0, n_simulations=1), ValueError, "rollout_depth of 1"),
-        (dict(value_expansion=1, rollout_replay=0.6), ValueError, "must not exceed 1"),
         (dict(value_expansion=1, forward_model="ensemble"), ValueError, "does without"),
         (
             dict(
@@ -208,9 +217,12 @@ def test_every_executed_action_is_as_it_is_simulated(make_agent, cls, dtype):
     assert agent.replay_buffer.dones.any()
 
 
-@pytest.mark.parametrize("cls, sde", [(MCBSSAC, False), (MCBSTQC, False), (MCBSSAC, True)])
-def test_soft_actions_and_their_entropy_are_sb3s(make_agent, cls, sde):
-    agent = make_agent("Hopper-v5", cls=cls, use_sde=sde, ent_coef=0.2)
+@pytest.mark.parametrize(
+    "cls, sde, ent_coef",
+    [(MCBSSAC, False, 0.2), (MCBSTQC, False, "auto_0.2"), (MCBSSAC, False, "auto_0.2"), (MCBSSAC, True, 0.2)],
+)
+def test_soft_actions_and_their_entropy_are_sb3s(make_agent, cls, sde, ent_coef):
+    agent = make_agent("Hopper-v5", cls=cls, use_sde=sde, ent_coef=ent_coef)
     observations = (
         np.random.default_rng(0).normal(size=(4000, 11)).astype(np.float32)[:1].repeat(4000, axis=0)
     )
@@ -218,7 +230,7 @@ def test_soft_actions_and_their_entropy_are_sb3s(make_agent, cls, sde):
     actions, bonus = draw(observations, np.random.default_rng(1))
     again, _ = draw(observations, np.random.default_rng(1))
     np.testing.assert_array_equal(actions, again)
-    np.testing.assert_allclose(bonus, entropy_function(agent)(observations, actions), rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(bonus, entropy(agent, observations, actions), rtol=1e-3, atol=1e-3)
     if sde:  # its exploration matrix is drawn once for all rows
         agent.actor.reset_noise(4000)
     theirs, log_prob = agent.actor.action_log_prob(th.as_tensor(observations))

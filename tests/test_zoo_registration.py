@@ -141,13 +141,13 @@ class Loaded(Exception):
 
 @pytest.fixture
 def saved_run(make_agent, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Put an agent with a large buffer where RL Zoo's commands find it, and end them when they load it."""
+    """Put an agent where RL Zoo's commands find it, and end them when they load it."""
 
     def save(algo: str) -> list[str]:
         run = tmp_path / "logs" / algo / "Pendulum-v1_1"
         (run / "Pendulum-v1").mkdir(parents=True)
         (run / "Pendulum-v1" / "config.yml").write_text("{}")
-        make_agent(cls=ALGORITHMS[algo], buffer_size=50_000).save(run / "Pendulum-v1.zip")
+        make_agent(cls=ALGORITHMS[algo]).save(run / "Pendulum-v1.zip")
         return ["--algo", algo, "--env", "Pendulum-v1", "-f", str(tmp_path / "logs"), "--no-render"]
 
     original = MCBS.load.__func__  # type: ignore[attr-defined]
@@ -167,7 +167,7 @@ def saved_run(make_agent, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         ("push_to_hub", "mcbs_tqc"),
     ],
 )
-def test_commands_that_show_an_agent_load_no_replay_buffer(
+def test_commands_that_show_an_agent_load_it(
     command: str, algo: str, saved_run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As ``python -m``, which runs a module's code without importing it."""
@@ -187,27 +187,6 @@ def test_commands_that_show_an_agent_load_no_replay_buffer(
     assert sys.excepthook is (hook.name_missing_library if command == "record_video" else before)
     (agent,) = loaded.value.args
     assert type(agent) is ALGORITHMS[algo]
-    assert agent.replay_buffer.buffer_size == agent.replay_buffer.observations.shape[0] == 1
-
-
-def test_imported_enjoy_loads_no_replay_buffer_without_the_hook(
-    saved_run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    words = saved_run("mcbs_td3")
-    monkeypatch.delitem(sys.modules, "rl_zoo3.enjoy", raising=False)
-    monkeypatch.setattr(sys, "meta_path", [f for f in sys.meta_path if type(f).__name__ != "ZooFinder"])
-    monkeypatch.setattr(sys, "argv", ["enjoy", *words])
-    enjoy = importlib.import_module("rl_zoo3.enjoy")
-    for n_rows in (50_000, 1):
-        with pytest.raises(Loaded) as loaded:
-            enjoy.enjoy()
-        assert loaded.value.args[0].replay_buffer.buffer_size == n_rows
-        register()
-    code = enjoy.enjoy.__code__
-    assert registration.with_our_off_policy_names(code) == code
-    assert {"dqn", "her", *ALGORITHMS} <= {
-        name for names in code.co_consts if isinstance(names, tuple) for name in names
-    }
 
 
 REPORT = """

@@ -188,14 +188,14 @@ def test_nothing_is_said_of_the_xml_of_half_cheetah(
 
 
 def test_names_need_no_quotes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    names = ("preset:strong", "tqc_value:truncated", "noise_type:ornstein-uhlenbeck", "noise_std:0.2")
+    names = ("preset:strong", "forward_model:pool", "noise_type:ornstein-uhlenbeck", "noise_std:0.2")
     classes = ("policy:MlpPolicy", "env_wrapper:sb3_mcbs.SnapshotEnvWrapper", "matmul_precision:None")
     words = ("-n", "101", "--eval-freq", "-1", "-params", *TINY, "n_threads:1", *names, *classes)
     zoo_train(monkeypatch, tmp_path, "mcbs_tqc", *words)
     config, _ = load_run(tmp_path / "logs" / "mcbs_tqc" / "Pendulum-v1_1")
     assert (config["preset"], config["policy"], config["matmul_precision"]) == ("strong", "MlpPolicy", None)
     agent = ALGORITHMS["mcbs_tqc"].load(tmp_path / "logs" / "mcbs_tqc" / "Pendulum-v1_1" / "Pendulum-v1.zip")
-    assert agent.search_settings == SearchSettings.preset("strong", n_threads=1, tqc_value="truncated")
+    assert agent.search_settings == SearchSettings.preset("strong", n_threads=1, forward_model="pool")
     assert "OrnsteinUhlenbeck" in repr(agent.action_noise)
 
 

@@ -89,7 +89,6 @@ def test_schedules_are_tuned_when_asked(
         "search_schedule": schedule,
         "search_share": 0.5,
         "search_unit": "episode",
-        "rollout_replay": 0.25,
         "value_expansion": 2,
     }
     params = {**SEARCH, **drawn, "final_share_factor": 0.2}
@@ -100,7 +99,7 @@ def test_schedules_are_tuned_when_asked(
     assert sampled.get("final_search_share") == (None if schedule == "constant" else 0.1)
     agent = make_agent("InvertedPendulum-v5", **sampled)
     assert {name: getattr(agent, name) for name in sampled} == sampled
-    with pytest.raises(optuna.TrialPruned, match="rollout_replay needs a rollout_depth"):
+    with pytest.raises(optuna.TrialPruned, match="value_expansion needs a rollout_depth"):
         sample({**params, "rollout_depth": 0, "n_simulations": 1})
 
 
@@ -116,7 +115,6 @@ def test_strategies_are_tuned_when_asked(base: str, monkeypatch: pytest.MonkeyPa
     monkeypatch.setenv(sampler.SWITCH, "strategies")
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
     seen: dict[str, int] = {}
-    values = set()
     held_or_narrow: set[tuple[int, int | None]] = set()
     for _ in range(400):
         trial = study.ask()
@@ -131,9 +129,6 @@ def test_strategies_are_tuned_when_asked(base: str, monkeypatch: pytest.MonkeyPa
         assert (settings.proposal_dims or 0) < 3, "three directions are all of them"
         held_or_narrow.add((settings.noise_hold, settings.proposal_dims))
         seen[settings.strategy] = seen.get(settings.strategy, 0) + 1
-        values.add((settings.entropy_bonus, settings.tqc_value))
-    assert {bonus for bonus, _ in values} == ({False, True} if base in ("sac", "tqc") else {False})
-    assert {value for _, value in values} == ({"mean", "truncated"} if base == "tqc" else {"mean"})
     assert {(1, None), (2, 1), (3, 2)} <= held_or_narrow
     assert set(seen) == set(sampler.STRATEGIES) and min(seen.values()) >= 5
 
@@ -162,7 +157,7 @@ def test_trials_go_with_every_entry_of_the_files(
     for held in map(dict, kinds):
         study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
         n_good = 0
-        for _ in range(150):
+        for _ in range(150):  # seldom so many: few go with a time budget
             trial = study.ask()
             trial.set_user_attr(sampler.HELD, held)
             try:
@@ -171,15 +166,16 @@ def test_trials_go_with_every_entry_of_the_files(
                 continue
             n_good += 1
             merged = {name: value for name, value in {**held, **params}.items() if name in names}
-            search, schedule, replay, expansion, _ = (
+            search, schedule, expansion, _ = (
                 settings(**{name: merged[name] for name in settings.names() if name in merged})
                 for settings in SETTINGS
             )
             assert search.noise_clip == held.get("noise_clip"), "limits are held"
             schedule.check_search(search)
-            replay.check_search(search)
-            expansion.check_search(search, replay.rollout_replay)
-        assert n_good > (0 if "time_budget" in held else 15), held
+            expansion.check_search(search)
+            if n_good == 10:
+                break
+        assert n_good >= (1 if "time_budget" in held else 10), held
         simulations_differ = "rollout_noise" not in held and held.get("strategy", "beam") == "beam"
         assert ("n_simulations" in trial.params) == (scope == "strategies" or simulations_differ)
 

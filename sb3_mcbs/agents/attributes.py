@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from sb3_mcbs.agents.hyperparameters import SETTING_NAMES, settings_of_preset
+from sb3_mcbs.agents.hyperparameters import REMOVED, SETTING_NAMES, refuse_removed, settings_of_preset
 from sb3_mcbs.agents.schedule import ScheduleSettings
 from sb3_mcbs.search import SearchSettings
 from sb3_mcbs.search.checks import CheckedSettings
@@ -37,15 +37,11 @@ class SearchAttributes:
     max_beam_width: int | None
     strategy: str
     n_proposals: int | None
-    common_noise: bool
     antithetic: bool
     branching: int
-    one_node_per_root: bool
     n_rounds: int
     n_elites: int | None
     min_noise: float
-    entropy_bonus: bool
-    tqc_value: str
     noise_hold: int
     proposal_dims: int | None
     search_schedule: str
@@ -57,7 +53,6 @@ class SearchAttributes:
     saturation_window: int
     saturation_tolerance: float
     recovery_tolerance: float
-    rollout_replay: float
     value_expansion: int
     expanded_share: float
     ensemble_size: int
@@ -67,8 +62,13 @@ class SearchAttributes:
     ensemble_pessimism: float
 
     def __setattr__(self, name: str, value: Any) -> None:
+        if name in REMOVED:
+            refuse_removed([name])
         if name not in _CHECKED or not self._is_set_up:
             super().__setattr__(name, value)
+        elif hasattr(type(self), name):  # a property of a class of the user's
+            super().__setattr__(name, value)
+            self._follow_settings()
         elif name == "preset" and value is not None:
             self._change_settings({**settings_of_preset(value), name: value})
         else:

@@ -80,7 +80,7 @@ def check_whole(vec_env: VecEnv) -> None:
             )
 
 
-class CheckedVecEnv(VecEnvWrapper):
+class VecCheckFinite(VecEnvWrapper):
     """Environments whose observations and rewards are checked before anyone else sees them.
 
     :param venv: the environments, with all their wrappers.

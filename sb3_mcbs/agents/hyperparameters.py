@@ -1,12 +1,11 @@
 """The settings of the search, and of what is learned from it, as parameters of constructors."""
 
 import inspect
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import Field, asdict, fields
 from typing import Any, TypedDict
 
 from sb3_mcbs.agents.learned_model import EnsembleSettings
-from sb3_mcbs.agents.rollout_replay import RolloutReplaySettings
 from sb3_mcbs.agents.schedule import ScheduleSettings
 from sb3_mcbs.agents.value_expansion import ValueExpansionSettings
 from sb3_mcbs.search import SearchSettings, with_preset
@@ -17,11 +16,19 @@ from sb3_mcbs.search.settings import OF_THE_MACHINE
 SETTINGS: tuple[type[CheckedSettings], ...] = (
     SearchSettings,
     ScheduleSettings,
-    RolloutReplaySettings,
     ValueExpansionSettings,
     EnsembleSettings,
 )
 SETTING_NAMES = frozenset(name for settings in SETTINGS for name in settings.names())
+
+#: Settings that there once were: what their default was, and what there is instead.
+REMOVED: dict[str, tuple[Any, str]] = {
+    "rollout_replay": (0.0, "learning from the search's rollouts brought nothing; value_expansion may"),
+    "entropy_bonus": (False, "the search adds no entropy to values; it cost returns"),
+    "tqc_value": ("mean", "TQC's value is always the mean over all quantiles"),
+    "common_noise": (False, "the later actions of every rollout have noise of their own; see antithetic"),
+    "one_node_per_root": (False, "a tree keeps its best nodes, whichever root action they grew from"),
+}
 
 _SEARCH_SETTINGS = "search_settings"
 
@@ -43,15 +50,11 @@ class SearchKeywords(TypedDict, total=False):
     max_beam_width: int | None
     strategy: str
     n_proposals: int | None
-    common_noise: bool
     antithetic: bool
     branching: int
-    one_node_per_root: bool
     n_rounds: int
     n_elites: int | None
     min_noise: float
-    entropy_bonus: bool
-    tqc_value: str
     noise_hold: int
     proposal_dims: int | None
     search_schedule: str
@@ -63,7 +66,6 @@ class SearchKeywords(TypedDict, total=False):
     saturation_window: int
     saturation_tolerance: float
     recovery_tolerance: float
-    rollout_replay: float
     value_expansion: int
     expanded_share: float
     ensemble_size: int
@@ -109,6 +111,7 @@ def complete_settings(
     :raises TypeError: if there is no such setting.
     :raises ValueError: if there is no such preset.
     """
+    refuse_removed(given)
     known = {field.name: field.default for field in setting_fields()}
     unknown = sorted(given.keys() - known.keys())
     if unknown:
@@ -117,6 +120,32 @@ def complete_settings(
             f"{list(known)}."
         )
     return {**known, **with_preset(preset, given)}
+
+
+def refuse_removed(names: Iterable[str]) -> None:
+    """Refuse settings that there once were.
+
+    :param names: of settings.
+    :raises TypeError: names them, and says what there is instead.
+    """
+    found = [f"{name} was removed: {REMOVED[name][1]}" for name in names if name in REMOVED]
+    if found:
+        raise TypeError("; ".join(found) + ". Leave it out.")
+
+
+def drop_removed(attributes: dict[str, Any]) -> None:
+    """Take removed settings with their defaults, which changed nothing, off an agent of an older file.
+
+    :param attributes: of the agent; changed.
+    :raises TypeError: if one has another value.
+    """
+    for name, (default, reason) in REMOVED.items():
+        if attributes.get(name, default) != default:
+            raise TypeError(
+                f"The agent was saved with {name}={attributes[name]!r}, which was removed: {reason}. To go "
+                f"on without it: load(..., custom_objects={{{name!r}: {default!r}}})."
+            )
+        attributes.pop(name, None)
 
 
 def settings_of_preset(name: str) -> dict[str, Any]:
@@ -131,7 +160,7 @@ def settings_of_preset(name: str) -> dict[str, Any]:
     for setting in OF_THE_MACHINE:
         del settings[setting]
     if name == "paper":
-        for defaults in (ScheduleSettings(), RolloutReplaySettings(), ValueExpansionSettings()):
+        for defaults in (ScheduleSettings(), ValueExpansionSettings()):
             settings |= asdict(defaults)
         settings["action_noise_after_search"] = False
     return settings

@@ -12,7 +12,7 @@ from stable_baselines3.common.preprocessing import get_action_dim
 from sb3_mcbs.models.ensemble import Ensemble, Transitions
 from sb3_mcbs.models.ensemble_model import check_observation_space
 from sb3_mcbs.search.checks import CheckedSettings
-from sb3_mcbs.search.streams import stream
+from sb3_mcbs.search.random_streams import spawn_rng
 
 #: One row of the replay buffer in so many is held out: always the last of them, so that a transition that was
 #: held out is never fitted later.
@@ -67,7 +67,7 @@ class LearnedModel:
     """
 
     def __init__(self, agent: OffPolicyAlgorithm, settings: EnsembleSettings) -> None:
-        self.rng = stream(agent.seed, "learned model")
+        self.rng = spawn_rng(agent.seed, "learned model")
         size = settings.ensemble_size
         obs_dim = spaces.flatdim(check_observation_space(agent.observation_space))
         act_dim = get_action_dim(agent.action_space)

@@ -9,11 +9,11 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_mcbs.agents.learned_model import LearnedModel
-from sb3_mcbs.agents.observation_pipeline import AgentView
+from sb3_mcbs.agents.observation_pipeline import ObservationPipeline
 from sb3_mcbs.agents.planner import Searcher
 from sb3_mcbs.models.ensemble import Transitions
 from sb3_mcbs.models.ensemble_model import EnsembleModel
-from sb3_mcbs.search import Moment, RecentActions, SearchResult, SearchSettings
+from sb3_mcbs.search import EpisodeClock, RecentActions, SearchResult, SearchSettings
 from sb3_mcbs.types import Observations, take_rows
 
 logger = logging.getLogger("sb3_mcbs")
@@ -59,7 +59,7 @@ class LearnedSearcher(Searcher):
 
     def _connect(self) -> None:
         agent: Any = self.agent
-        self.view = AgentView(self._vec_env, self._reward_normalizer())
+        self.view = ObservationPipeline(self._vec_env, self._reward_normalizer())
         self._all_envs = range(self._vec_env.num_envs)
         ensemble = self._learned_model.ensemble
         self._ensemble_model = EnsembleModel(
@@ -89,13 +89,12 @@ class LearnedSearcher(Searcher):
         rng: np.random.Generator,
         envs: Sequence[int] | None = None,
         effort: SearchSettings | None = None,
-        record: bool = False,
     ) -> SearchResult:
         if self.ready:
             agent: Any = self.agent
             self._ensemble_model.ensemble = self._learned_model.ensemble
             self._ensemble_model.pessimism = agent.ensemble_pessimism
-            return super().search(observations, rng, envs, effort, record)
+            return super().search(observations, rng, envs, effort)
         if not self._said_not_ready:
             self._said_not_ready = True
             logger.warning(
@@ -160,6 +159,6 @@ class LearnedSearcher(Searcher):
             )
         )
 
-    def _moments(self, envs: Sequence[int]) -> list[Moment]:
+    def _episode_clocks(self, envs: Sequence[int]) -> list[EpisodeClock]:
         # Never the same moment twice: no plan is recalled.
         return [(self._n_searches, 0)] * len(envs)

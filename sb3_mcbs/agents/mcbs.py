@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -16,14 +17,20 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from sb3_mcbs.agents.attributes import SearchAttributes
 from sb3_mcbs.agents.exploration import DrawnNoise, noise_without_search
 from sb3_mcbs.agents.faults import (
-    CheckedVecEnv,
+    VecCheckFinite,
     check_observations,
     diverged_environments,
     environment_named,
     leave_out_step,
     warn_of_divergence,
 )
-from sb3_mcbs.agents.hyperparameters import complete_settings, list_search_settings, settings_of_preset
+from sb3_mcbs.agents.hyperparameters import (
+    complete_settings,
+    drop_removed,
+    list_search_settings,
+    refuse_removed,
+    settings_of_preset,
+)
 from sb3_mcbs.agents.learned_model import (
     EnsembleSettings,
     LearnedModel,
@@ -35,8 +42,8 @@ from sb3_mcbs.agents.planner import Searcher
 from sb3_mcbs.agents.schedule import ScheduleSettings, SearchSchedule
 from sb3_mcbs.agents.simulated_batches import SimulatedBatches
 from sb3_mcbs.networks.torch_settings import matmul_precision
-from sb3_mcbs.search import RecentActions, Rollouts, SearchResult, SearchSettings
-from sb3_mcbs.search.streams import stream
+from sb3_mcbs.search import RecentActions, SearchResult, SearchSettings
+from sb3_mcbs.search.random_streams import spawn_rng
 
 SelfMCBS = TypeVar("SelfMCBS", bound="MCBS")
 
@@ -93,13 +100,12 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         self.n_critic_evaluations = 0
         self.n_diverged_steps = 0
         self._searcher: Searcher | None = None
-        #: What was executed, chosen -1 where it was not, and the environments that were searched.
+        #: What was executed, and the environments that were searched.
         self._decision: tuple[SearchResult, Sequence[int]] | None = None
-        self._rollouts: Rollouts | None = None
         self.rollout_rng: np.random.Generator | None = None
         self._simulated_batches: SimulatedBatches | None = None
         self.learned_model: LearnedModel | None = None
-        self._checked_env: CheckedVecEnv | None = None
+        self._checked_env: VecCheckFinite | None = None
         self._noise_without_search: ActionNoise | None = None
 
     def _checked_settings(self) -> tuple[SearchSettings, ScheduleSettings]:
@@ -113,6 +119,7 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
 
     def _setup_model(self) -> None:
         # ``load`` sets attributes without calling the constructor, so settings are checked here.
+        drop_removed(vars(self))
         settings, schedule = self._checked_settings()
         # ``load`` seeds once more; generators that it has restored go on instead.
         self._is_restored = self.search_rng is not None and self._seed_at_setup == self.seed
@@ -140,9 +147,12 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         check_learned_model(self)
         if self._simulated_batches is not None and self.replay_buffer is not None:
             self._simulated_batches.check_settings()
-        if self._searcher is not None and not self._searcher.follow(settings):
+        before = self._searcher
+        if before is not None and not before.follow(settings):
             assert self.env is not None
             self._make_searcher(self.env, settings)
+            assert self._searcher is not None
+            self._searcher.go_on_after(before)
         if self.recent_actions is None and settings.proposal_dims is not None:
             self.recent_actions = (
                 RecentActions(get_action_dim(self.action_space))
@@ -155,22 +165,40 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
             self._explore_where_not_searched()
 
     def _make_searcher(self, env: VecEnv, settings: SearchSettings) -> None:
-        before, self._decision, self._rollouts = self._searcher, None, None
+        before, self._decision = self._searcher, None
         # What this environment's VecNormalize does is what the critics learn from.
         normalizer = unwrap_vec_normalize(env)
         normalize_reward = normalizer is not None and normalizer.norm_reward
         self._searcher = make_searcher(self, env, settings, normalize_reward, self.recent_actions)
-        if before is not None:
-            before.close()
         if self._simulated_batches is not None:
             self._simulated_batches.connect()
+        if before is not None:
+            before.close()
         if self.verbose >= 1:
             print(f"Forward model: {self._searcher.description}")
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        before = dict(vars(self))
         super().set_env(env, force_reset)
         assert self.env is not None
-        self._make_searcher(self.env, self.search_settings)
+        try:
+            self._make_searcher(self.env, self.search_settings)
+        except Exception:  # the environment of before stays
+            vars(self).clear()
+            vars(self).update(before)
+            raise
+
+    def __copy__(self: SelfMCBS) -> SelfMCBS:
+        # As with SB3's agents, networks and environments are those of the original. Settings are not.
+        made = type(self).__new__(type(self))
+        vars(made).update(vars(self))
+        for name in ("_schedule", "_searcher"):
+            vars(made)[name] = copy(vars(self)[name])
+        if made._searcher is not None:
+            made._searcher.agent = made
+        if made._simulated_batches is not None:
+            made._simulated_batches = SimulatedBatches(made)
+        return made
 
     def set_random_seed(self, seed: int | None = None) -> None:
         super().set_random_seed(seed)
@@ -180,10 +208,10 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
     def _seed_search(self, seed: int | None) -> None:
         self.search_rng = np.random.default_rng(seed)
         if self._schedule is not None:
-            self._schedule.rng = stream(seed, "schedule")
-        self.rollout_rng = stream(seed, "rollout replay")
+            self._schedule.rng = spawn_rng(seed, "schedule")
+        self.rollout_rng = spawn_rng(seed, "value expansion")
         if self.learned_model is not None:
-            self.learned_model.rng = stream(seed, "learned model")
+            self.learned_model.rng = spawn_rng(seed, "learned model")
 
     def _sample_action(
         self,
@@ -203,7 +231,10 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         """
         assert self._simulated_batches is not None
         self._simulated_batches.look()
-        self._decision = self._rollouts = None
+        self._decision = None
+        self._check_noise_after_search()
+        if self._noise_without_search is None:  # action_noise may have been taken away
+            self._explore_where_not_searched()
         # For all environments whatever is searched, so that random streams do not depend on the schedule.
         drawn_from = self._noise_without_search if action_noise is None else action_noise
         noise = None if drawn_from is None else DrawnNoise(drawn_from)
@@ -220,8 +251,7 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
             return actions, scaled_actions
         self.logger.record("search/frequency", self._schedule.share(self._progress))
         executed = self._schedule.draw(self._progress, self.num_timesteps)
-        # Rollouts to learn from are wanted everywhere.
-        searched = np.flatnonzero(executed | (self.rollout_replay > 0)).tolist()
+        searched = np.flatnonzero(executed).tolist()
         if not searched:
             return actions, scaled_actions
 
@@ -231,26 +261,25 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
             drawn = np.broadcast_to(noise.last, scaled_actions.shape)[searched]
             found = np.clip(found + drawn, -1, 1).astype(found.dtype)
         else:
-            chosen = np.where(executed[searched], result.chosen, -1)
-            self._decision = result._replace(chosen=chosen), searched
+            self._decision = result, searched
         if executed.all():
             return self.policy.unscale_action(found), found
         # Of one kind, so that actions reach the environments as they are simulated.
         scaled_actions = scaled_actions.astype(found.dtype)
-        scaled_actions[executed] = found[executed[searched]]
+        scaled_actions[executed] = found
         return self.policy.unscale_action(scaled_actions), scaled_actions
 
     def _search(self, envs: Sequence[int]) -> SearchResult:
-        """Search in some environments, and keep their rollouts if they are learned from."""
+        """Search in some environments."""
         assert self._last_obs is not None, "self._last_obs was not set"
         assert self._searcher is not None and self.search_rng is not None, "learn() needs an environment"
         assert self._schedule is not None
-        effort = self._schedule.effort(self._searcher.settings, self._progress)
-        record = self.rollout_replay > 0
+        effort = self._schedule.settings_at(self._searcher.settings, self._progress)
+        if self._vec_normalize_env is not None:
+            self._searcher.normalize_rewards(self._vec_normalize_env.norm_reward)
         start = time.perf_counter()
-        result = self._searcher.search(self._last_obs, self.search_rng, envs, effort, record)
+        result = self._searcher.search(self._last_obs, self.search_rng, envs, effort)
         self._record_decision(result, time.perf_counter() - start, effort)
-        self._rollouts = result.rollouts
         return result
 
     @property
@@ -286,7 +315,7 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
             error = self._searcher.model_error(*self._decision, new_obs, raw_reward, infos)
         if error is not None:
             self.logger.record_mean("search/model_error", error)
-        self._simulated_batches.store(replay_buffer.pos, self._rollouts, dones)
+        self._simulated_batches.store(replay_buffer.pos, dones)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
     def _note_step(self, reward: np.ndarray, dones: np.ndarray) -> np.ndarray:
@@ -300,7 +329,7 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
 
     def collect_rollouts(self, env: VecEnv, *args: Any, **kwargs: Any) -> RolloutReturn:
         if self._checked_env is None or self._checked_env.venv is not env:
-            self._checked_env = CheckedVecEnv(env)
+            self._checked_env = VecCheckFinite(env)
         self._leave_out_unstored()  # of a training that goes on in another agent, if a callback copied it
         try:
             return super().collect_rollouts(self._checked_env, *args, **kwargs)
@@ -326,11 +355,7 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
     ) -> tuple[int, BaseCallback]:
         self._noise_without_search = None
         self._explore_where_not_searched()
-        if self.action_noise_after_search and self.action_noise is None:
-            raise ValueError(
-                "action_noise_after_search adds action_noise to searched actions, and there is none: pass an "
-                "action_noise."
-            )
+        self._check_noise_after_search()
         if self.learned_model is not None:
             assert self.replay_buffer is not None
             self.learned_model.check_room(self.replay_buffer)
@@ -347,8 +372,16 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
             self._schedule.begin_episodes(self.n_envs, self.num_timesteps)
         return result
 
+    def _check_noise_after_search(self) -> None:
+        if self.action_noise_after_search and self.action_noise is None:
+            raise ValueError(
+                "action_noise_after_search adds action_noise to searched actions, and there is none: pass an "
+                "action_noise."
+            )
+
     def _explore_where_not_searched(self) -> None:
-        if not self.schedule_settings.searches_always or self.learned_model is not None:
+        assert self._schedule is not None
+        if not self._schedule.settings.searches_always or self.learned_model is not None:
             known = self._noise_without_search is not None
             self._noise_without_search = noise_without_search(self, self.beam_noise, say=not known)
 
@@ -432,8 +465,10 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
             is searched, except for settings beside it
         :return: the model
         """
-        if kwargs.get("preset") is not None:
-            kwargs = {**settings_of_preset(kwargs["preset"]), **kwargs}
+        refuse_removed(kwargs)
+        preset = kwargs.get("preset", (kwargs.get("custom_objects") or {}).get("preset"))
+        if preset is not None:
+            kwargs = {**settings_of_preset(preset), **kwargs}
         return super().load(path, *args, **kwargs)
 
     @classmethod
@@ -469,6 +504,5 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         return super().predict(observation, state, episode_start, deterministic)
 
     def _excluded_save_params(self) -> list[str]:
-        transient = ["_searcher", "_decision", "_rollouts", "_checked_env", "_simulated_batches",
-                     "_noise_without_search"]  # fmt: skip
+        transient = ["_searcher", "_decision", "_checked_env", "_simulated_batches", "_noise_without_search"]
         return [*super()._excluded_save_params(), *transient]

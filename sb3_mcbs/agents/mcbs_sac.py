@@ -19,8 +19,8 @@ class MCBSSAC(MCBS, SAC):
 
     As :class:`~sb3_mcbs.MCBSTD3`, with the losses of SAC: ``matmul_precision`` holds for them too.
     Searched actions lie around the actor's mean action, not around one that the actor (or gSDE) drew, and
-    rollouts end with the minimum of the critics' values, without an entropy term unless ``entropy_bonus`` is
-    set. Before ``learning_starts`` the agent acts as SAC does.
+    rollouts end with the minimum of the critics' values, without an entropy term. Before ``learning_starts``
+    the agent acts as SAC does.
 
     ``predict`` is the actor alone, without search, as for every SB3 algorithm: it needs no environment.
     To act with search use :class:`~sb3_mcbs.SearchPolicy`.

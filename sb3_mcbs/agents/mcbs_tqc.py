@@ -19,8 +19,8 @@ class MCBSTQC(MCBS, TQC):
 
     As :class:`~sb3_mcbs.MCBSTD3`, with the losses of TQC: ``matmul_precision`` holds for them too.
     Searched actions lie around the actor's mean action, not around one that the actor (or gSDE) drew, and
-    rollouts end with the mean over all quantiles of all critics, or as ``tqc_value`` says, without an entropy
-    term unless ``entropy_bonus`` is set. Before ``learning_starts`` the agent acts as TQC does.
+    rollouts end with the mean over all quantiles of all critics, without an entropy term. Before
+    ``learning_starts`` the agent acts as TQC does.
 
     ``predict`` is the actor alone, without search, as for every SB3 algorithm: it needs no environment.
     To act with search use :class:`~sb3_mcbs.SearchPolicy`.
@@ -53,7 +53,7 @@ class MCBSTQC(MCBS, TQC):
     :param target_update_interval: update the target network every ``target_update_interval`` gradient steps
     :param target_entropy: target entropy when learning ``ent_coef``
     :param top_quantiles_to_drop_per_net: Number of quantiles to drop per network in the critics' target; the
-        search drops none unless ``tqc_value="truncated"``
+        search drops none
     :param use_sde: Whether to use generalized State Dependent Exploration (gSDE), for actions chosen without
         search and for the losses
     :param sde_sample_freq: Sample a new noise matrix every n steps when using gSDE; -1: only at the beginning

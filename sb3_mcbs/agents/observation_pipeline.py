@@ -33,7 +33,7 @@ _TRANSPARENT = (VecCheckNan, VecMonitor, VecVideoRecorder)
 _PURE = (VecNormalize, VecTransposeImage, VecExtractDictObs)
 
 
-class AgentView:
+class ObservationPipeline:
     """Observations and rewards as an agent's replay buffer keeps them, and as its networks see them.
 
     Only ``VecNormalize`` is between the two, whatever other wrappers there are.
@@ -97,7 +97,7 @@ class AgentView:
         return np.clip(scaled, -normalizer.clip_reward, normalizer.clip_reward)
 
 
-class VecEnvView(AgentView):
+class EnvironmentPipeline(ObservationPipeline):
     """The same from the environments' own observations on, which other wrappers may alter too.
 
     :param vec_env: the environment that the agent acts in.

@@ -8,15 +8,14 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from sb3_contrib import TQC
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_mcbs.agents.faults import InvalidDecisions, check_networks, check_observations, is_finite
 from sb3_mcbs.agents.observation_pipeline import (
-    AgentView,
-    VecEnvView,
+    EnvironmentPipeline,
+    ObservationPipeline,
     reward_normalizer,
     snapshot_environments,
 )
@@ -24,8 +23,6 @@ from sb3_mcbs.agents.own_environments import InOwnEnvironments
 from sb3_mcbs.models import Environments, ForwardModelError, make_forward_model
 from sb3_mcbs.networks.functions import (
     check_agent,
-    entropy_coefficient,
-    entropy_function,
     policy_function,
     unscale_function,
     value_function,
@@ -34,18 +31,18 @@ from sb3_mcbs.networks.torch_settings import matmul_precision, one_thread
 from sb3_mcbs.search import (
     Agent,
     Decision,
-    Moment,
-    Pace,
-    PlanMemory,
+    EpisodeClock,
+    LatencyForecast,
     RecentActions,
     SearchResult,
     SearchSettings,
+    WarmStart,
     check_dynamics,
     deadline_search,
     search,
 )
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
-from sb3_mcbs.types import Observations, difference, equal, map_arrays, n_rows, row_of, stack, take_rows
+from sb3_mcbs.types import Observations, difference, equal, n_rows, row_of, stack, take_rows
 
 logger = logging.getLogger("sb3_mcbs")
 
@@ -83,9 +80,9 @@ class Searcher(InOwnEnvironments):
         self._previous_step_differed = False
         self._invalid_decisions = InvalidDecisions()
         #: Rounds of other sizes take other times.
-        self._paces: defaultdict[tuple[int, int], Pace] = defaultdict(Pace)
-        self._plans: PlanMemory | None = None
-        self.view: AgentView
+        self._paces: defaultdict[tuple[int, int], LatencyForecast] = defaultdict(LatencyForecast)
+        self._plans: WarmStart | None = None
+        self.view: ObservationPipeline
         if settings.rollout_depth > 0:
             self._connect()
             # What it was found out from may have changed when a copy connects.
@@ -93,7 +90,6 @@ class Searcher(InOwnEnvironments):
         self._take_over(settings)
 
     def _check(self, settings: SearchSettings) -> None:
-        check_values(self.agent, settings)
         if (settings.proposal_dims or 0) > self._act_dim:
             raise ValueError(
                 f"proposal_dims must be at most {self._act_dim}, the entries of an action here; got "
@@ -115,19 +111,39 @@ class Searcher(InOwnEnvironments):
         self._take_over(settings)
         return True
 
+    def normalize_rewards(self, normalize: bool) -> None:
+        """Follow a ``VecNormalize`` whose ``norm_reward`` was switched.
+
+        :param normalize: whether the critics learn from normalised rewards.
+        """
+        if normalize != self.normalize_reward and self.model is not None:
+            self.normalize_reward = normalize
+            self.view.reward_normalizer = self._reward_normalizer()
+
     def _take_over(self, settings: SearchSettings) -> None:
-        if self.model is not None:
-            check_dynamics(settings, self.model.deterministic)
+        model = vars(self).get("model")  # a copy without environments has none yet
+        if model is not None:
+            check_dynamics(settings, model.deterministic)
         plans = self._plans
         if settings.strategy != "refine":
             plans = None
         elif plans is None or settings.horizon != self.settings.horizon:
-            plans = PlanMemory(len(self._all_envs), settings.horizon, self._act_dim)
+            plans = WarmStart(self._vec_env.num_envs, settings.horizon, self._act_dim)
         self.settings, self._plans = settings, plans
+
+    def go_on_after(self, before: "Searcher") -> None:
+        """Know what another one noticed about the same environments.
+
+        :param before: what searched with other settings.
+        """
+        self._invalid_decisions, self._paces = before._invalid_decisions, before._paces
+        if self.model is not None and before.model is not None and self.model.kind == before.model.kind:
+            self.model.deterministic &= before.model.deterministic
+            check_dynamics(self.settings, self.model.deterministic)
 
     def _connect(self) -> None:
         settings = self.settings
-        view = VecEnvView(self._vec_env, self._reward_normalizer())
+        view = EnvironmentPipeline(self._vec_env, self._reward_normalizer())
         self.view = view
         self.environments: Environments = snapshot_environments(view.base)
         self._all_envs = range(len(self.environments))
@@ -152,7 +168,6 @@ class Searcher(InOwnEnvironments):
         rng: np.random.Generator,
         envs: Sequence[int] | None = None,
         effort: SearchSettings | None = None,
-        record: bool = False,
     ) -> SearchResult:
         """Choose an action for every environment, or for some.
 
@@ -161,8 +176,6 @@ class Searcher(InOwnEnvironments):
         :param envs: which environments, rising; nothing is read of the others, or simulated for them.
             ``None``: all.
         :param effort: the settings with another width or depth, if they are not to be those of always.
-        :param record: whether the result shall hold the rollouts, with observations as replay buffers keep
-            them; with the strategy ``"beam"``.
         :return: actions, and what the search found, a row for each of ``envs``.
         :raises ValueError: if the observations are not those of the environments' present states.
         :raises NonFiniteError: if the networks, or the observations, are not finite.
@@ -184,10 +197,12 @@ class Searcher(InOwnEnvironments):
             if settings.time_budget is None:
                 shape = (n_rows(observations), self._act_dim)
                 decision = Decision(self.model, roots, observations, agent, settings, shape, rng)
-                decision = decision._replace(record=record, directions=directions)
+                decision = decision._replace(directions=directions)
                 if self._plans is not None:
                     assert envs is not None
-                    decision = decision._replace(memory=self._plans, envs=envs, moments=self._moments(envs))
+                    decision = decision._replace(
+                        memory=self._plans, envs=envs, clocks=self._episode_clocks(envs)
+                    )
                 result = search(decision)
             else:
                 assert self.model is not None
@@ -199,7 +214,7 @@ class Searcher(InOwnEnvironments):
         if result.invalid_rollouts or not is_finite(result.actions):
             check_networks(agent.policy, agent.value, observations)
         self._invalid_decisions.note(result, self.model)
-        return self._as_replay_buffers_keep_them(result) if record else result
+        return result
 
     def check_networks(self, observations: Observations) -> None:
         """Find out whether the networks have diverged.
@@ -208,16 +223,6 @@ class Searcher(InOwnEnvironments):
         :raises NonFiniteError: if it is the networks, or the observations, that are not finite.
         """
         check_networks(policy_function(self.agent), value_function(self.agent), observations)
-
-    def _as_replay_buffers_keep_them(self, result: SearchResult) -> SearchResult:
-        assert result.rollouts is not None
-        rollouts = result.rollouts
-        shape = rollouts.lengths.shape
-        rows = map_arrays(lambda array: array.reshape(-1, *array.shape[2:]), rollouts.observations)
-        observations = map_arrays(
-            lambda array: array.reshape(*shape, *array.shape[1:]), self.view.observe(rows, normalize=False)
-        )
-        return result._replace(rollouts=rollouts._replace(observations=observations))
 
     def note_actions(self, actions: np.ndarray) -> None:
         """Remember what is executed, if the search learns directions from it.
@@ -251,7 +256,7 @@ class Searcher(InOwnEnvironments):
         if self.model is None or not self.model.deterministic or result.first_step is None:
             return None
         view = self.view
-        assert isinstance(view, VecEnvView)
+        assert isinstance(view, EnvironmentPipeline)
         predicted = view.observe(result.first_step.observations)
         error = 0.0
         for row in np.flatnonzero(result.chosen >= 0).tolist():
@@ -279,7 +284,7 @@ class Searcher(InOwnEnvironments):
             "kind": None if model is None else model.kind,
             "deterministic": None if model is None else model.deterministic,
             "previous_step_differed": self._previous_step_differed,
-            "plans": None if self._plans is None else self._plans.state(self._moments(self._all_envs)),
+            "plans": None if self._plans is None else self._plans.state(self._episode_clocks(self._all_envs)),
             "recent_actions": None if self.settings.proposal_dims is None else self.recent_actions.state(),
         }
 
@@ -291,7 +296,7 @@ class Searcher(InOwnEnvironments):
         if self.model is None:
             return
         if self._plans is not None and memory.get("plans") is not None:
-            self._plans.set_state(memory["plans"], self._moments(self._all_envs))
+            self._plans.set_state(memory["plans"], self._episode_clocks(self._all_envs))
         self._go_on_with(memory["kind"], memory["deterministic"])
 
     def _go_on_with(self, kind: str, deterministic: bool) -> None:
@@ -306,22 +311,16 @@ class Searcher(InOwnEnvironments):
     def agent_functions(self) -> Agent:
         """The agent as it is now, as a search knows it: functions of the environments' own observations."""
         policy, gamma = policy_function(self.agent), self.agent.gamma
-        value, unscale = value_function(self.agent, self.settings.tqc_value), unscale_function(self.agent)
+        value, unscale = value_function(self.agent), unscale_function(self.agent)
         if self.model is None:
             return Agent(policy, value, gamma, unscale, lambda rewards: rewards)
         observe = self.view.observe
-        agent = Agent(
+        return Agent(
             policy=lambda observations: policy(observe(observations)),
             value=lambda observations, actions: value(observe(observations), actions),
             gamma=gamma,
             unscale_action=unscale,
             scale_reward=self.view.scale_reward,
-        )
-        if not self.settings.entropy_bonus:
-            return agent
-        bonus = entropy_function(self.agent)
-        return agent._replace(
-            entropy_bonus=lambda observations, actions: bonus(observe(observations), actions)
         )
 
     def unscale(self, actions: np.ndarray) -> np.ndarray:
@@ -343,7 +342,7 @@ class Searcher(InOwnEnvironments):
 
     def _present_observations(self, observations: Observations, envs: Sequence[int]) -> Observations:
         """The environments' own observations, checked against those that the agent was given."""
-        assert isinstance(self.view, VecEnvView)
+        assert isinstance(self.view, EnvironmentPipeline)
         present = self.environments.apply(envs, _last_observation)
         for row, observation in enumerate(present):
             if observation is None:
@@ -363,8 +362,8 @@ class Searcher(InOwnEnvironments):
             )
         return stacked
 
-    def _moments(self, envs: Sequence[int]) -> list[Moment]:
-        return self.environments.apply(envs, _moment)
+    def _episode_clocks(self, envs: Sequence[int]) -> list[EpisodeClock]:
+        return self.environments.apply(envs, _episode_clock)
 
     def read_roots(self, envs: Sequence[int]) -> list[Any]:
         """Read the environments' present states, also where the simulator was exchanged.
@@ -420,29 +419,6 @@ class Searcher(InOwnEnvironments):
         warnings.warn(message, stacklevel=4)
 
 
-def check_values(agent: OffPolicyAlgorithm, settings: SearchSettings) -> None:
-    """Refuse settings of values that the agent's networks do not give.
-
-    :param agent: a supported agent.
-    :param settings: of the search.
-    :raises ValueError: says which setting, and why.
-    """
-    if settings.entropy_bonus:
-        entropy_coefficient(agent)
-    if settings.tqc_value == "truncated":
-        if not isinstance(agent, TQC):
-            raise ValueError(
-                f"tqc_value='truncated' is for TQC's quantiles; a {type(agent).__name__} has none. Leave it "
-                "out."
-            )
-        n_quantiles = agent.policy.critic.n_quantiles
-        if not 0 <= agent.top_quantiles_to_drop_per_net < n_quantiles:
-            raise ValueError(
-                "tqc_value='truncated' needs a top_quantiles_to_drop_per_net from 0 to below the number of "
-                f"quantiles, {n_quantiles}; got {agent.top_quantiles_to_drop_per_net}."
-            )
-
-
 def _simulators_settings(settings: SearchSettings) -> tuple[Any, ...]:
     """What the forward model is made with."""
     return settings.forward_model, settings.n_threads, settings.rollout_depth > 0
@@ -452,5 +428,5 @@ def _last_observation(env: SnapshotEnvWrapper) -> Any:
     return env.last_observation
 
 
-def _moment(env: SnapshotEnvWrapper) -> Moment:
-    return env.moment
+def _episode_clock(env: SnapshotEnvWrapper) -> EpisodeClock:
+    return env.episode_clock

@@ -7,8 +7,8 @@ import numpy as np
 
 from sb3_mcbs.agents.saturation import Episode, Saturation
 from sb3_mcbs.search.checks import CheckedSettings
+from sb3_mcbs.search.random_streams import spawn_rng
 from sb3_mcbs.search.settings import MAX_DEPTH, MAX_ROLLOUTS, SearchSettings
-from sb3_mcbs.search.streams import stream
 
 SCHEDULES = ("constant", "saturation", "anneal")
 UNITS = ("step", "episode")
@@ -158,16 +158,6 @@ class ScheduleSettings(CheckedSettings):
             if end is not None
         }
 
-    def most_rollouts(self, settings: SearchSettings) -> tuple[int, int]:
-        """How many rollouts a decision of the training has at most, and of how many steps.
-
-        :param settings: where it begins.
-        """
-        return (
-            max(settings.beam_width, self.final_beam_width or 0) * settings.n_simulations,
-            max(settings.rollout_depth, self.final_rollout_depth or 0),
-        )
-
 
 class SearchSchedule:
     """Says at every step which environments are searched, and how wide and deep.
@@ -183,7 +173,7 @@ class SearchSchedule:
 
     def __init__(self, settings: ScheduleSettings, seed: int | None) -> None:
         self.settings = settings
-        self.rng = stream(seed, "schedule")
+        self.rng = spawn_rng(seed, "schedule")
         self.saturation = Saturation()
         self._last_step = 0
         self.begin_episodes(0, 0)
@@ -212,7 +202,7 @@ class SearchSchedule:
             return settings.share_at_end if self.saturation.is_reduced else settings.search_share
         return settings.search_share + (settings.share_at_end - settings.search_share) * progress
 
-    def effort(self, settings: SearchSettings, progress: float) -> SearchSettings:
+    def settings_at(self, settings: SearchSettings, progress: float) -> SearchSettings:
         """The search's settings at present.
 
         :param settings: where the training begins.

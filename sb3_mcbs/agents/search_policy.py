@@ -1,7 +1,7 @@
 """Act with search with any trained agent."""
 
 import operator
-from copy import deepcopy
+from copy import copy, deepcopy
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -12,14 +12,14 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.preprocessing import maybe_transpose
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-from sb3_mcbs.agents.hyperparameters import settings_of_preset
+from sb3_mcbs.agents.hyperparameters import SETTING_NAMES, refuse_removed, settings_of_preset
 from sb3_mcbs.agents.learned_search import make_searcher
 from sb3_mcbs.agents.mcbs import MCBS
 from sb3_mcbs.search import SearchResult, SearchSettings, with_preset
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 
 #: What is not simply replaced when it is set.
-_HELD = ("model", "vec_env", "settings")
+_HELD = ("model", "vec_env", "settings", "preset")
 
 
 class SearchPolicy:
@@ -32,7 +32,7 @@ class SearchPolicy:
         policy = SearchPolicy(model, vec_env, beam_width=6, rollout_depth=3)
         evaluate_policy(policy, vec_env)
 
-    SAC and TQC propose their mean action; TQC's value is the mean over quantiles that ``tqc_value`` says.
+    SAC and TQC propose their mean action; TQC's value is the mean over all quantiles.
     Settings are attributes: one that is set (``policy.beam_width = 20``) holds from the next decision on, and
     ``policy.settings = ...`` sets them all. Attributes that this class does not have are those of the agent
     (``save``, ``get_env``, ``logger``, ...).
@@ -60,6 +60,7 @@ class SearchPolicy:
         preset: str | None = None,
         **search_settings: Any,
     ) -> None:
+        refuse_removed(search_settings)
         unknown = sorted(set(search_settings) - set(SearchSettings.names()))
         if unknown:
             raise TypeError(f"Unknown search settings {unknown}; known are {list(SearchSettings.names())}.")
@@ -86,9 +87,11 @@ class SearchPolicy:
             return
         make = partial(make_searcher, self.model, self.vec_env, self.settings)
         self.searcher = make(before.normalize_reward, before.recent_actions)
+        self.searcher.go_on_after(before)
         before.close()
 
     def __setattr__(self, name: str, value: Any) -> None:
+        refuse_removed([name])
         attributes = vars(self)
         if "searcher" not in attributes or (name in attributes and name not in _HELD):
             super().__setattr__(name, value)
@@ -97,13 +100,26 @@ class SearchPolicy:
         elif name == "settings":
             self._change_settings(value)
         elif name == "preset":
-            self.settings = replace(self.settings, **_of_the_search(settings_of_preset(value)))
+            if value is not None:
+                self.settings = replace(self.settings, **_of_the_search(settings_of_preset(value)))
+            attributes["preset"] = value
         elif name in SearchSettings.names():
-            self.settings = replace(self.settings, **{name: value})
+            changes = {name: value}
+            if changes == {"rollout_depth": 0} and self.settings.forward_model == "ensemble":
+                changes["forward_model"] = "auto"  # where nothing simulates, no model does
+            self.settings = replace(self.settings, **changes)
         elif hasattr(self.model, name):
             setattr(self.model, name, value)
+        elif name in SETTING_NAMES:
+            raise AttributeError(f"{name} is for agents that search while they train.")
         else:
             super().__setattr__(name, value)
+
+    def __copy__(self) -> "SearchPolicy":
+        made = type(self).__new__(type(self))
+        vars(made).update(vars(self))
+        vars(made)["searcher"] = copy(self.searcher)
+        return made
 
     def _change_settings(self, settings: SearchSettings) -> None:
         if not isinstance(settings, SearchSettings):

@@ -10,14 +10,14 @@ travel several steps in one update.
 from collections.abc import Callable
 from dataclasses import dataclass
 from operator import itemgetter
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from sb3_contrib import TQC
 from stable_baselines3 import SAC
+from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_mcbs.agents.mixed_batches import Outcome, Samples, as_samples
 from sb3_mcbs.agents.planner import Searcher
 from sb3_mcbs.models import ForwardModelError
 from sb3_mcbs.networks.functions import policy_function, soft_policy_function, unscale_function
@@ -26,6 +26,8 @@ from sb3_mcbs.search import SearchResult, SearchSettings
 from sb3_mcbs.search.checks import CheckedSettings
 from sb3_mcbs.search.interface import FirstStep
 from sb3_mcbs.types import Observations, map_arrays, put_rows, take_rows
+
+Samples = ReplayBufferSamples | DictReplayBufferSamples
 
 #: More steps than this after every sampled transition are a mistake.
 MAX_EXPANSION = 1000
@@ -52,11 +54,10 @@ class ValueExpansionSettings(CheckedSettings):
         if self.value_expansion and not self.expanded_share:
             raise ValueError("value_expansion needs an expanded_share above 0: nothing would be expanded.")
 
-    def check_search(self, settings: SearchSettings, rollout_replay: float) -> None:
+    def check_search(self, settings: SearchSettings) -> None:
         """Refuse what does not go together.
 
         :param settings: of the search.
-        :param rollout_replay: share of every batch that is taken from rollouts.
         :raises ValueError: says which setting, and why.
         """
         if not self.value_expansion:
@@ -71,11 +72,6 @@ class ValueExpansionSettings(CheckedSettings):
                 "value_expansion goes on in the simulator, which forward_model='ensemble' does without: "
                 "leave one of the two out."
             )
-        if rollout_replay + self.expanded_share > 1:
-            raise ValueError(
-                "rollout_replay and expanded_share are parts of the same batch and must not exceed 1 "
-                f"together; got {rollout_replay} and {self.expanded_share}."
-            )
 
     def check_buffer(self, optimize_memory_usage: bool) -> None:
         """Refuse replay buffers that do not keep what is needed.
@@ -88,6 +84,21 @@ class ValueExpansionSettings(CheckedSettings):
                 "value_expansion goes on from the last observation of a transition, which a replay buffer "
                 "with optimize_memory_usage does not keep at the end of an episode: leave that out."
             )
+
+
+class _Outcome(NamedTuple):
+    """What transitions of several steps came to.
+
+    :param returns: ``[n]``, discounted sums of rewards as the networks are given them.
+    :param lengths: ``[n]``, steps.
+    :param terminated: ``[n]`` bool, whether the environment ended the episode.
+    :param observations: ``[n, *]``, the last ones, as replay buffers keep them.
+    """
+
+    returns: np.ndarray
+    lengths: np.ndarray
+    terminated: np.ndarray
+    observations: Observations
 
 
 class ValueExpansion:
@@ -107,8 +118,8 @@ class ValueExpansion:
         buffer = self._buffer = cast(Any, agent.replay_buffer)
         shape = (buffer.buffer_size, buffer.n_envs)
         held = getattr(buffer, "expansion_states", None)
+        (state,) = self._states(range(1))
         if held is None or held.shape[:2] != shape:
-            (state,) = self._states(range(1))
             buffer.expansion_states = np.zeros((*shape, len(state)))
             buffer.expansion_held = np.zeros(shape, dtype=bool)
 
@@ -192,7 +203,7 @@ class ValueExpansion:
         """
         buffer = self._buffer
         at = rng.integers(0, buffer.size(), n), rng.integers(0, buffer.n_envs, n)
-        outcome = Outcome(
+        outcome = _Outcome(
             np.array(buffer._normalize_reward(buffer.rewards[at], env), dtype=np.float64),
             np.ones(n, dtype=int),
             (buffer.dones[at] * (1 - buffer.timeouts[at])).astype(bool),
@@ -203,13 +214,13 @@ class ValueExpansion:
             states = buffer.expansion_states[at[0][going], at[1][going]]
             with one_thread():
                 self._go_on(states, going, outcome, gamma, rng, env)
-        return as_samples(buffer, at, buffer.actions[at], outcome, gamma, env)
+        return _as_samples(buffer, at, buffer.actions[at], outcome, gamma, env)
 
     def _go_on(
         self,
         states: np.ndarray,
         going: np.ndarray,
-        outcome: Outcome,
+        outcome: _Outcome,
         gamma: float,
         rng: np.random.Generator,
         env: VecNormalize | None,
@@ -244,3 +255,34 @@ class ValueExpansion:
             if len(still) < len(going):
                 model.select(still)
                 going = going[still]
+
+
+def _as_samples(
+    buffer: Any,
+    at: tuple[np.ndarray, ...],
+    actions: np.ndarray,
+    outcome: _Outcome,
+    gamma: float,
+    env: VecNormalize | None,
+) -> Samples:
+    """Make a batch, as replay buffers do.
+
+    :param buffer: the replay buffer.
+    :param at: rows and environments ``[n]`` where the transitions begin.
+    :param actions: ``[n, act_dim]``, the first ones.
+    :param outcome: ``[n]``.
+    :param gamma: discount factor per step.
+    :param env: normalises observations.
+    :return: the batch, with discounts for the next observations' values.
+    """
+    first = buffer._normalize_obs(map_arrays(itemgetter(at), buffer.observations), env)
+    last = buffer._normalize_obs(outcome.observations, env)
+    samples = DictReplayBufferSamples if isinstance(first, dict) else ReplayBufferSamples
+    return samples(
+        map_arrays(buffer.to_torch, first),
+        buffer.to_torch(actions),
+        map_arrays(buffer.to_torch, last),
+        buffer.to_torch(outcome.terminated.astype(np.float32)[:, None]),
+        buffer.to_torch(outcome.returns.astype(np.float32)[:, None]),
+        buffer.to_torch((gamma**outcome.lengths).astype(np.float32)[:, None]),
+    )

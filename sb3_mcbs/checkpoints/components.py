@@ -30,7 +30,6 @@ NOT_STATE: dict[type, dict[str, str]] = {
         "start_time": "the time that was used so far is saved instead",
         "_searcher": "its forward model simulates the environments as they are; what it noticed is saved",
         "_decision": "of the last step; made anew before it is read",
-        "_rollouts": "of the last step; made anew before it is read",
         "_simulated_batches": "a view of the replay buffer",
         "_reasons_said": "what the user of this process was told",
         "_checked_env": "a view of the environment",

@@ -1,8 +1,8 @@
 """Frozen state as data: JSON and plain arrays, and back, without ever importing or unpickling.
 
-A frozen value (:mod:`sb3_mcbs.snapshot.graph`) consists of plain values, arrays, and names of classes and
-functions. Names are all that is written of those: they are resolved among the classes and functions that the
-reader hands in, because its own agent and environments use them.
+A frozen value (:mod:`sb3_mcbs.snapshot.object_graph`) consists of plain values, arrays, and names of classes
+and functions. Names are all that is written of those: they are resolved among the classes and functions that
+the reader hands in, because its own agent and environments use them.
 """
 
 import enum
@@ -22,7 +22,7 @@ import torch as th
 from sb3_mcbs.checkpoints.errors import CheckpointError
 from sb3_mcbs.snapshot.classes import ClassName
 from sb3_mcbs.snapshot.functions import FunctionName
-from sb3_mcbs.snapshot.graph import Ref, class_name
+from sb3_mcbs.snapshot.object_graph import Ref, class_name
 
 #: Compiled containers that are made by calling their class; nothing else is ever called. Making a partial
 #: calls nothing, and what it will call is among the functions that may be named.

@@ -28,9 +28,9 @@ from sb3_mcbs.checkpoints.encoding import Decoder, Encoded, Encoder, name_of
 from sb3_mcbs.checkpoints.environments import describe_environment, make_environment
 from sb3_mcbs.checkpoints.errors import CheckpointError
 from sb3_mcbs.checkpoints.files import results_file
-from sb3_mcbs.checkpoints.kinds import KINDS, kind_of
+from sb3_mcbs.checkpoints.handlers import HANDLERS, handler_of
 from sb3_mcbs.snapshot import SnapshotUnsupportedError
-from sb3_mcbs.snapshot.graph import Freezer, Thawer
+from sb3_mcbs.snapshot.object_graph import Freezer, Thawer
 
 #: Parameters of constructors that are kept under another name.
 _ATTRIBUTES = {"policy": "policy_class", "stats_window_size": "_stats_window_size"}
@@ -48,7 +48,7 @@ def describe_agent(agent: OffPolicyAlgorithm) -> Encoded:
     :return: the class's name and its constructor's arguments.
     :raises CheckpointError: if one cannot be written as data; names it.
     """
-    encoder, freezer = Encoder(), Freezer(kind_of, {}, 0)
+    encoder, freezer = Encoder(), Freezer(handler_of, {}, 0)
     settings = {}
     for parameter in inspect.signature(type(agent).__init__).parameters.values():
         if parameter.name in _NOT_SETTINGS or parameter.kind is parameter.VAR_KEYWORD:
@@ -95,7 +95,7 @@ def make_agent(encoded: Encoded, names: dict[str, Any], env: GymEnv) -> OffPolic
     cls = decoder.decode({"name": encoded.json["class"]})
     if not (isinstance(cls, type) and issubclass(cls, OffPolicyAlgorithm)):
         raise CheckpointError(f"The checkpoint names {cls!r} as the class of its agent.")
-    thawer = Thawer(decoder.decode_nodes(encoded.json["nodes"]), KINDS, [], "restore")
+    thawer = Thawer(decoder.decode_nodes(encoded.json["nodes"]), HANDLERS, [], "restore")
     settings = {name: thawer.thaw(decoder.decode(value)) for name, value in encoded.json["settings"].items()}
     thawer.commit()
     return cls(env=env, **settings)

@@ -24,12 +24,12 @@ from sb3_mcbs.checkpoints.environments import (
 )
 from sb3_mcbs.checkpoints.errors import CheckpointError
 from sb3_mcbs.checkpoints.files import file_of, open_log_files, read_written, results_file, write_again
-from sb3_mcbs.checkpoints.kinds import KINDS, kind_of
+from sb3_mcbs.checkpoints.handlers import HANDLERS, handler_of
 from sb3_mcbs.checkpoints.names import known_names
 from sb3_mcbs.models import Environments, WorkerEnvironments
 from sb3_mcbs.snapshot import SnapshotEnvWrapper, SnapshotError, SnapshotUnsupportedError
 from sb3_mcbs.snapshot.attributes import freeze_attributes, thaw_attributes
-from sb3_mcbs.snapshot.graph import Freezer, Ref, Thawer, class_name
+from sb3_mcbs.snapshot.object_graph import Freezer, Ref, Thawer, class_name
 
 RUN = "run"
 _POLICY = "policy"
@@ -133,7 +133,7 @@ class RunState:
 
     def _encode(self) -> tuple[Encoder, Encoded]:
         parts = self._components
-        freezer = Freezer(kind_of, {id(part): Ref(i) for i, part in enumerate(parts.values())}, len(parts))
+        freezer = Freezer(handler_of, {id(part): Ref(i) for i, part in enumerate(parts.values())}, len(parts))
         encoder = Encoder()
         attributes: dict[str, Any] = {}
         nodes: list[Any] = []
@@ -161,7 +161,9 @@ class RunState:
         parts = self._components
         names = {**known_names(classes), **self._encode()[0].names}
         decoder = Decoder(encoded.arrays, names)
-        thawer = Thawer(decoder.decode_nodes(encoded.json["nodes"]), KINDS, list(parts.values()), "restore")
+        thawer = Thawer(
+            decoder.decode_nodes(encoded.json["nodes"]), HANDLERS, list(parts.values()), "restore"
+        )
         if encoded.json["attributes"].keys() != parts.keys():
             raise CheckpointError("The checkpoint's run has other parts than this one.")
         try:

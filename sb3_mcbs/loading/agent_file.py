@@ -14,10 +14,6 @@ from sb3_mcbs.loading.archive import AgentFileError, naming, read_members
 
 MAX_DATA_BYTES = 2**24
 MAX_POLICY_BYTES = 2**29
-MAX_VARIABLES_BYTES = 2**16
-VARIABLES = "pytorch_variables.pth"
-#: Shapes of what SB3 keeps of an entropy coefficient: the logarithm of a learned one, or a given one.
-_ENTROPY_SHAPES = {"log_ent_coef": (1,), "ent_coef_tensor": ()}
 
 
 @dataclass(frozen=True)
@@ -66,26 +62,6 @@ def read_agent_file(path: str | Path) -> AgentFile:
         raise AgentFileError(f"{path}: 'data' must be a JSON object, not a {type(data).__name__}.")
     unread = [name for name in names if name not in contents]
     return AgentFile(path, data, _read_tensors(path, "policy.pth", contents["policy.pth"]), unread)
-
-
-def read_entropy_coefficient(path: Path) -> dict[str, th.Tensor]:
-    """Read the entropy coefficient of a SAC or TQC agent.
-
-    :param path: a zip file that ``save`` of an SB3 algorithm wrote.
-    :return: by the name of SB3's attribute, the coefficient or the logarithm of a learned one; empty if the
-        file has none.
-    :raises AgentFileError: if it is damaged, or no coefficient.
-    """
-    contents, _ = read_members(path, {VARIABLES: MAX_VARIABLES_BYTES})
-    variables = _read_tensors(path, VARIABLES, contents[VARIABLES]) if contents else {}
-    found = {name: variables[name] for name in _ENTROPY_SHAPES if name in variables}
-    for name, tensor in found.items():
-        coefficient = tensor.exp() if name == "log_ent_coef" else tensor
-        if tuple(tensor.shape) != _ENTROPY_SHAPES[name] or not 0 <= float(coefficient) < float("inf"):
-            raise AgentFileError(
-                f"{path}: {name} must be one number, and the coefficient finite and from 0 on."
-            )
-    return found
 
 
 def _read_tensors(path: Path, member: str, content: bytes) -> dict[str, th.Tensor]:

@@ -18,13 +18,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_mcbs.agents.mcbs import MCBS
 from sb3_mcbs.agents.registry import ALGORITHMS
-from sb3_mcbs.loading.agent_file import (
-    VARIABLES,
-    AgentFile,
-    is_pickled,
-    read_agent_file,
-    read_entropy_coefficient,
-)
+from sb3_mcbs.loading.agent_file import AgentFile, is_pickled, read_agent_file
 from sb3_mcbs.loading.architecture import Architecture, check_shapes, check_spaces, read_architecture
 from sb3_mcbs.loading.archive import AgentFileError
 from sb3_mcbs.loading.network_settings import is_number, network_settings
@@ -78,16 +72,11 @@ def load_agent(
         if issubclass(ALGORITHMS[name], TQC):
             networks["n_quantiles"] = architecture.n_outputs
         numbers, warnings = _numbers(file, name, architecture)
-        entropy = read_entropy_coefficient(file.path) if architecture.stochastic else {}
     warnings += _differing_bounds(file, env.action_space)
     agent = _build(ALGORITHMS[name], env, networks, numbers, architecture.use_sde, device, file.tensors)
-    for attribute, tensor in entropy.items():
-        setattr(agent, attribute, tensor.to(agent.device))
     for warning in warnings:
         logger.warning("%s: %s", file.path, warning)
     left = _not_taken_over(file, {*numbers, "use_sde"}, policy_kwargs)
-    if entropy:
-        del left[VARIABLES]
     agent.not_taken_over = left  # type: ignore[attr-defined]
     kind, activation = type(agent).__name__, networks["activation_fn"].__name__
     logger.info("%s: loaded as %s with %s. Not taken over: %s", file.path, kind, activation, list(left))

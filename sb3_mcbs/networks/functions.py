@@ -9,7 +9,6 @@ import torch as th
 from gymnasium import spaces
 from sb3_contrib import TQC
 from stable_baselines3 import DDPG, SAC, TD3
-from stable_baselines3.common.distributions import TanhBijector
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import obs_as_tensor
@@ -37,28 +36,6 @@ def check_agent(agent: OffPolicyAlgorithm) -> None:
         )
     if not isinstance(agent.action_space, spaces.Box):
         raise ValueError(f"A search needs a continuous (Box) action space, got {agent.action_space}.")
-
-
-def entropy_coefficient(agent: OffPolicyAlgorithm) -> float:
-    """What an agent's losses multiply the entropy with at present.
-
-    :param agent: a SAC or TQC agent.
-    :raises ValueError: if it is another one, or was loaded from a file that does not say it.
-    """
-    if not isinstance(agent, SAC | TQC):
-        raise ValueError(
-            f"entropy_bonus=True is for SAC and TQC: the actor of a {type(agent).__name__} is deterministic "
-            "and has no entropy. Leave it out."
-        )
-    # SB3 has one of the two: the first where the coefficient is learned.
-    if agent.log_ent_coef is not None:
-        return agent.log_ent_coef.detach().exp().item()
-    if getattr(agent, "ent_coef_tensor", None) is None:
-        raise ValueError(
-            "entropy_bonus=True needs the agent's entropy coefficient, which its file does not say. Set it: "
-            "agent.ent_coef_tensor = torch.tensor(0.1)."
-        )
-    return agent.ent_coef_tensor.item()
 
 
 def _if_plain(make: Callable[[Any], _T], network: Any) -> _T | None:
@@ -118,25 +95,15 @@ def _actions(mlp: MLP, observations: np.ndarray) -> np.ndarray:
         return _to_numpy(mlp(_columns(observations, None, mlp.device)), mlp.device).T
 
 
-def value_function(
-    agent: OffPolicyAlgorithm, tqc_value: str = "mean"
-) -> Callable[[Observations, np.ndarray], np.ndarray]:
+def value_function(agent: OffPolicyAlgorithm) -> Callable[[Observations, np.ndarray], np.ndarray]:
     """The online critics' estimate: the minimum over critics, or TQC's mean over quantiles.
 
     :param agent: a supported agent. Its networks are those of now: make this function for every search.
-    :param tqc_value: which quantiles, see :class:`~sb3_mcbs.SearchSettings`.
     :return: observations ``[rows, *obs_shape]``, scaled actions ``[rows, act_dim]`` -> ``[rows]``.
     """
     policy: Any = agent.policy
     critic = policy.critic
     quantiles = isinstance(agent, TQC)
-
-    def mean_quantile(quantiles: th.Tensor) -> th.Tensor:
-        # ``[quantiles of all critics, rows]``
-        if tqc_value == "truncated":
-            n_dropped = agent.top_quantiles_to_drop_per_net * critic.n_critics  # type: ignore[attr-defined]
-            quantiles = quantiles.sort(dim=0).values[: len(quantiles) - n_dropped]
-        return quantiles.mean(dim=0)
 
     mlps = _if_plain(critic_mlps, critic)
     if mlps is None:
@@ -150,38 +117,15 @@ def value_function(
                 inputs = _columns(observations, actions, device)
                 columns = [mlp(inputs) for mlp in mlps]
                 if quantiles:
-                    return _to_numpy(mean_quantile(th.cat(columns)), device)
+                    return _to_numpy(th.cat(columns).mean(dim=0), device)
                 return _to_numpy(functools.reduce(th.minimum, columns)[0], device)
             tensor = obs_as_tensor(observations, device)
             estimates = critic(tensor, th.as_tensor(actions, device=device))
             if quantiles:
-                return mean_quantile(estimates.flatten(1).t()).cpu().numpy()
+                return estimates.flatten(1).t().mean(dim=0).cpu().numpy()
             return th.cat(estimates, dim=1).amin(dim=1).cpu().numpy()
 
     return value
-
-
-def entropy_function(agent: OffPolicyAlgorithm) -> Callable[[Observations, np.ndarray], np.ndarray]:
-    """What actions add to the soft value: ``-ent_coef * log pi(a|s)``.
-
-    :param agent: a SAC or TQC agent. Its actor is that of now: make this function for every search.
-    :return: observations ``[rows, *obs_shape]``, scaled actions ``[rows, act_dim]`` -> ``[rows]``.
-    """
-    policy: Any = agent.policy
-    actor, device = policy.actor, policy.device
-    policy.set_training_mode(False)
-
-    def bonus(observations: Observations, actions: np.ndarray) -> np.ndarray:
-        with th.no_grad():
-            distribution = _distribution(actor, obs_as_tensor(observations, device))
-            squashed = th.as_tensor(actions, device=device)
-            mean = distribution.distribution.mean
-            # Where tanh is saturated its inverse is a guess; that of the policy's own action is known.
-            latent = th.where(squashed == th.tanh(mean), mean, TanhBijector.inverse(squashed))
-            log_prob = _log_prob(actor, distribution, squashed, latent)
-            return (-entropy_coefficient(agent) * log_prob).cpu().numpy()
-
-    return bonus
 
 
 def soft_policy_function(
@@ -204,7 +148,10 @@ def soft_policy_function(
             latent = normal.mean + normal.stddev * th.as_tensor(noise, device=device)
             actions = th.tanh(latent)
             log_prob = _log_prob(actor, distribution, actions, latent)
-            return actions.cpu().numpy(), (-entropy_coefficient(agent) * log_prob).cpu().numpy()
+            # SB3 has one of the two: the first where the coefficient is learned.
+            learned = own.log_ent_coef
+            coefficient = own.ent_coef_tensor if learned is None else learned.detach().exp()
+            return actions.cpu().numpy(), (-coefficient.item() * log_prob).cpu().numpy()
 
     return draw
 

@@ -16,6 +16,8 @@ import torch as th
 from stable_baselines3 import TD3
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.td3 import td3 as td3_module
+from torch.nn import functional as F
 
 from sb3_mcbs.networks.mlp import MLP
 from sb3_mcbs.networks.plain_networks import actor_mlp, check_trained, critic_mlps, parameters_of
@@ -146,6 +148,12 @@ class TD3Update:
             th._foreach_add_(targets, networks, alpha=self._agent.tau)
 
 
+#: What TD3's ``train`` calls besides networks and optimizers. Somebody may put something else in its place.
+_CALLED = [
+    (owner, name, getattr(owner, name)) for owner, name in ((F, "mse_loss"), (td3_module, "polyak_update"))
+]
+
+
 class FastUpdate(TD3):
     """
     TD3, or a subclass of it, whose gradient steps are those of :class:`TD3Update` where they can be.
@@ -164,6 +172,8 @@ class FastUpdate(TD3):
         self._present_update()  # whoever cannot have it is told at once
 
     def _make_update(self) -> TD3Update:
+        if any(getattr(owner, name) is not function for owner, name, function in _CALLED):
+            raise TypeError("a function that TD3's train calls was replaced")
         if getattr(super().train, "__func__", None) is not _SB3S_TRAIN:
             raise TypeError("a class of the agent's has a train of its own")
         return TD3Update(self)

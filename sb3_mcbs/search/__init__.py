@@ -1,27 +1,26 @@
 """Search over a forward model: proposing candidates, rolling them out, scoring, selecting."""
 
 from sb3_mcbs.search.beam import beam_search
-from sb3_mcbs.search.deadline import Pace, deadline_search
+from sb3_mcbs.search.deadline import LatencyForecast, deadline_search
 from sb3_mcbs.search.directions import RecentActions
-from sb3_mcbs.search.interface import Agent, FirstStep, Rollouts, SearchResult
-from sb3_mcbs.search.memory import Moment, PlanMemory
+from sb3_mcbs.search.interface import Agent, FirstStep, SearchResult
 from sb3_mcbs.search.proposals import Noise, draw_noise
 from sb3_mcbs.search.settings import PRESETS, SearchSettings, with_preset
 from sb3_mcbs.search.strategies import Decision, check_dynamics, search
+from sb3_mcbs.search.warm_start import EpisodeClock, WarmStart
 
 __all__ = [
     "PRESETS",
     "Agent",
     "Decision",
+    "EpisodeClock",
     "FirstStep",
-    "Moment",
+    "LatencyForecast",
     "Noise",
-    "Pace",
-    "PlanMemory",
     "RecentActions",
-    "Rollouts",
     "SearchResult",
     "SearchSettings",
+    "WarmStart",
     "beam_search",
     "check_dynamics",
     "deadline_search",

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_mcbs.search.interface import Agent, FirstStep, Rollouts, SearchResult, stopped_values
+from sb3_mcbs.search.interface import Agent, FirstStep, SearchResult, stopped_values
 from sb3_mcbs.search.proposals import (
     Noise,
     clip_actions,
@@ -19,7 +19,7 @@ from sb3_mcbs.search.proposals import (
     without_first,
 )
 from sb3_mcbs.search.settings import SearchSettings
-from sb3_mcbs.types import ForwardModel, Observations, Transition, map_arrays, put_rows, take_rows
+from sb3_mcbs.types import ForwardModel, Observations, take_rows
 
 _ALL = slice(None)
 
@@ -43,7 +43,6 @@ def beam_search(
     settings: SearchSettings,
     noise: Noise,
     rng: np.random.Generator,
-    record: bool = False,
 ) -> SearchResult:
     """Choose one action per environment (Algorithm 1, steps 1 to 3).
 
@@ -54,7 +53,6 @@ def beam_search(
     :param settings: width, depth and simulations.
     :param noise: from :func:`draw_noise`.
     :param rng: given to a model with random dynamics, see :meth:`ForwardModel.set_roots`.
-    :param record: whether the result holds the rollouts, if there are any.
     :return: actions, and what the search found.
     """
     policy_actions = agent.policy(observations)
@@ -70,12 +68,8 @@ def beam_search(
         values = critic_values(observations, candidates, agent)[..., None]
         return choose(policy_actions, candidates, values, None, 0)
     assert model is not None, "a rollout needs a forward model"
-    recorder = RolloutRecorder(settings.horizon) if record else None
-    evaluated = rollout_values(model, roots, candidates, agent, settings, noise, rng, recorder=recorder)
-    result = choose(policy_actions, candidates, *evaluated)
-    if recorder is None:
-        return result
-    return result._replace(rollouts=recorder.rollouts(candidates, evaluated[0].shape[2]))
+    evaluated = rollout_values(model, roots, candidates, agent, settings, noise, rng)
+    return choose(policy_actions, candidates, *evaluated)
 
 
 def choose(
@@ -129,7 +123,6 @@ def rollout_values(
     noise: Noise,
     rng: np.random.Generator,
     out_of_time: Callable[[], bool] = lambda: False,
-    recorder: "RolloutRecorder | None" = None,
 ) -> tuple[np.ndarray, FirstStep, int]:
     """Evaluate ShortHorizon for every environment, candidate and simulation (Algorithm 1, step 2).
 
@@ -140,7 +133,6 @@ def rollout_values(
     :param candidates: ``[n_envs, beam, act_dim]``.
     :param noise: of those candidates: 0 where one is the policy's own action.
     :param out_of_time: asked before every step; True gives up.
-    :param recorder: is told every step.
     :return: values ``[n_envs, beam, sim]`` in float64 (NaN where a simulation was invalid), the first step of
         every candidate ``[n_envs * beam]``, and the number of simulated steps.
     :raises OutOfTimeError: if it gave up.
@@ -169,8 +161,6 @@ def rollout_values(
             first_step = FirstStep(
                 take_rows(observations, every_candidate), step.rewards[every_candidate].copy()
             )
-        if recorder is not None:
-            recorder.note_step(step, unfinished)
         rewards = agent.scale_reward(step.rewards)
         all_valid = step.valid.all()
         if not all_valid:
@@ -192,103 +182,26 @@ def rollout_values(
         actions = agent.policy(observations)
         is_last = step_number == settings.horizon
         if step_number == hold and shared > 1:
-            if recorder is not None:
-                recorder.split(shared)
             returns, actions = np.repeat(returns, shared), np.repeat(actions, shared, axis=0)
             if unfinished is not _ALL:
                 unfinished = _split(unfinished, shared)
             rows = np.repeat(np.arange(len(actions) // shared) if rows is None else rows, shared)
-            if is_last or agent.entropy_bonus is not None:
+            if is_last:
                 observations = take_rows(observations, np.arange(len(actions)) // shared)
         held = first_noise if step_number < hold else later_noise[step_number // hold - 1]
         actions = clip_actions(actions + held[unfinished])
-        if is_last or agent.entropy_bonus is not None:
-            returns[unfinished] += discount * _beyond_rewards(agent, observations, actions, is_last)
-        if not is_last and rows is not None:
+        if is_last:
+            returns[unfinished] += discount * agent.value(observations, actions).astype(np.float64)
+        elif rows is not None:
             model.select(rows)
-    return _of_simulations(returns, n_envs, beam, n_sim), first_step, simulated_steps
+    # Simulations that ended before they differed have the same value.
+    values = np.repeat(returns, n_envs * beam * n_sim // len(returns))
+    return values.reshape(n_envs, beam, n_sim), first_step, simulated_steps
 
 
 def _split(index: Any, into: int) -> np.ndarray:
     """The places of what each of some rows became."""
     return (index[:, None] * into + np.arange(into)).ravel()
-
-
-def _of_simulations(values: np.ndarray, n_envs: int, beam: int, n_sim: int) -> np.ndarray:
-    """Give every simulation its value, also those that ended before they differed."""
-    values = np.repeat(values, n_envs * beam * n_sim // len(values), axis=0)
-    return values.reshape(n_envs, beam, n_sim, *values.shape[1:])
-
-
-def _beyond_rewards(agent: Agent, observations: Observations, actions: np.ndarray, is_last: bool) -> Any:
-    """What an action after the first is worth beside its rewards, in float64.
-
-    :param is_last: whether the critics' value closes the rollout.
-    :return: ``[rows]``.
-    """
-    worth = agent.value(observations, actions).astype(np.float64) if is_last else 0.0
-    if agent.entropy_bonus is not None:
-        worth = worth + agent.entropy_bonus(observations, actions).astype(np.float64)
-    return worth
-
-
-class RolloutRecorder:
-    """Keeps what rollouts went through.
-
-    :param horizon: steps of a rollout.
-    """
-
-    def __init__(self, horizon: int) -> None:
-        self._horizon = horizon
-        self._depth = 0
-
-    def note_step(self, step: Transition, unfinished: np.ndarray | slice) -> None:
-        """Keep a step of all rollouts that go on.
-
-        :param step: ``[rows]``.
-        :param unfinished: which rollouts those are.
-        """
-        if self._depth == 0:
-            n_rollouts = len(step.rewards)
-            self._rewards = np.zeros((n_rollouts, self._horizon))
-            self._lengths = np.zeros(n_rollouts, dtype=int)
-            self._terminated = np.zeros(n_rollouts, dtype=bool)
-            self._observations = take_rows(step.observations, _ALL)
-        else:
-            put_rows(self._observations, unfinished, step.observations, _ALL)
-        self._rewards[unfinished, self._depth] = step.rewards
-        self._lengths[unfinished] = np.where(step.valid, self._depth + 1, 0)
-        self._terminated[unfinished] = step.terminated
-        self._depth += 1
-
-    def split(self, into: int) -> None:
-        """Every rollout becomes several.
-
-        :param into: how many.
-        """
-        self._rewards = np.repeat(self._rewards, into, axis=0)
-        self._lengths = np.repeat(self._lengths, into)
-        self._terminated = np.repeat(self._terminated, into)
-        self._observations = map_arrays(lambda array: np.repeat(array, into, axis=0), self._observations)
-
-    def rollouts(self, candidates: np.ndarray, n_sim: int) -> Rollouts:
-        """All of them.
-
-        :param candidates: ``[n_envs, beam, act_dim]``, their first actions.
-        :param n_sim: simulations of each.
-        """
-        n_envs, beam = candidates.shape[:2]
-
-        def by_env(array: np.ndarray) -> np.ndarray:
-            return _of_simulations(array, n_envs, beam, n_sim).reshape(n_envs, -1, *array.shape[1:])
-
-        return Rollouts(
-            np.repeat(candidates, n_sim, axis=1),
-            by_env(self._rewards),
-            by_env(self._lengths),
-            by_env(self._terminated),
-            map_arrays(by_env, self._observations),
-        )
 
 
 def join_rounds(first_steps: list[FirstStep], n_envs: int) -> FirstStep:

@@ -44,7 +44,7 @@ class _Durations:
         return len(self._last) >= _WARM_UP
 
 
-class Pace:
+class LatencyForecast:
     """Forecasts how long rounds take, from those that were done.
 
     :param clock: seconds, rising.
@@ -112,7 +112,7 @@ class Pace:
 class _Watch:
     """Asked before every step of a round whether to give up; learns how long the steps take."""
 
-    def __init__(self, pace: Pace, width: int, deadline: float) -> None:
+    def __init__(self, pace: LatencyForecast, width: int, deadline: float) -> None:
         self._pace, self._width, self._deadline = pace, width, deadline
         self._start = self._step_start = pace.clock()
         self._depth = -1
@@ -153,7 +153,7 @@ def deadline_search(
     agent: Agent,
     settings: SearchSettings,
     deadline: float,
-    pace: Pace,
+    pace: LatencyForecast,
     rng: np.random.Generator,
     directions: np.ndarray | None = None,
 ) -> SearchResult:

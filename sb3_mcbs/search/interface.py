@@ -22,8 +22,6 @@ class Agent(NamedTuple):
     :param gamma: discount factor per environment step.
     :param unscale_action: scaled actions ``[rows, act_dim]`` -> actions of the environment.
     :param scale_reward: rewards of the environment ``[rows]`` -> the scale that the critics know.
-    :param entropy_bonus: observations ``[rows, ...]``, scaled actions ``[rows, act_dim]`` -> what the actions
-        add to the value by being random, ``-ent_coef * log pi(a|s)``, ``[rows]``. ``None``: nothing.
     """
 
     policy: Callable[[Observations], np.ndarray]
@@ -31,7 +29,6 @@ class Agent(NamedTuple):
     gamma: float
     unscale_action: Callable[[np.ndarray], np.ndarray]
     scale_reward: Callable[[np.ndarray], np.ndarray]
-    entropy_bonus: Callable[[Observations, np.ndarray], np.ndarray] | None = None
 
 
 class CountedValue:
@@ -62,24 +59,6 @@ class FirstStep(NamedTuple):
     rewards: np.ndarray
 
 
-class Rollouts(NamedTuple):
-    """What every rollout of a search by Algorithm 1 went through, before the critics closed it.
-
-    :param actions: ``[n_envs, rollouts, act_dim]``, the first action, scaled; ``rollouts`` are the
-        simulations of the first candidate, those of the second, and so on.
-    :param rewards: ``[n_envs, rollouts, rollout_depth]``, of the environment; 0 after the rollout's end.
-    :param lengths: ``[n_envs, rollouts]``, steps until the end; 0 where the rollout diverged.
-    :param terminated: ``[n_envs, rollouts]``, whether the environment ended it.
-    :param observations: ``[n_envs, rollouts, *obs_shape]``, the last one.
-    """
-
-    actions: np.ndarray
-    rewards: np.ndarray
-    lengths: np.ndarray
-    terminated: np.ndarray
-    observations: Observations
-
-
 class SearchResult(NamedTuple):
     """The outcome of one decision in every environment.
 
@@ -97,7 +76,6 @@ class SearchResult(NamedTuple):
     :param rounds: finished rounds: 1, or any number if the search had a time budget, or ``n_rounds``.
     :param critic_evaluations: observations with an action that the critics rated.
     :param surviving_roots: of a tree: ``[n_envs]``, how many root actions still had a node at the end.
-    :param rollouts: what was simulated, if that was asked for.
     """
 
     actions: np.ndarray
@@ -110,14 +88,13 @@ class SearchResult(NamedTuple):
     rounds: int = 1
     critic_evaluations: int = 0
     surviving_roots: np.ndarray | None = None
-    rollouts: Rollouts | None = None
 
 
 def stopped_values(step: Transition, agent: Agent) -> tuple[np.ndarray, np.ndarray]:
     """Value the rows of a step whose episode the environment itself truncated.
 
     :param step: ``[rows]``, with ``stopped``.
-    :param agent: its critics value what its policy would do there, with its entropy if that counts.
+    :param agent: its critics value what its policy would do there.
     :return: which rows ``[n]``, and their values ``[n]`` in float64.
     """
     assert step.stopped is not None
@@ -126,7 +103,4 @@ def stopped_values(step: Transition, agent: Agent) -> tuple[np.ndarray, np.ndarr
         return rows, np.zeros(0)
     observations = take_rows(step.observations, rows)
     actions = agent.policy(observations)
-    values = agent.value(observations, actions).astype(np.float64)
-    if agent.entropy_bonus is not None:
-        values += agent.entropy_bonus(observations, actions).astype(np.float64)
-    return rows, values
+    return rows, agent.value(observations, actions).astype(np.float64)

@@ -48,10 +48,10 @@ def draw_noise(
     n_proposals = settings.n_proposals or b
     pairs = settings.antithetic
     beam = draw_normal(rng, (n_envs, n_proposals, act_dim), 1 if pairs else None)
-    shape = (d, n_envs, 1 if settings.common_noise else b, n, act_dim)
+    shape = (d, n_envs, b, n, act_dim)
     rollout = scale(draw_normal(rng, shape, 3 if pairs else None), settings.effective_rollout_noise, settings)
     beam = scale(low_dimensional(beam, directions), settings.beam_noise, settings)
-    return Noise(beam, np.broadcast_to(rollout, (d, n_envs, b, n, act_dim)))
+    return Noise(beam, rollout)
 
 
 def draw_normal(rng: np.random.Generator, shape: tuple[int, ...], pairs: int | None) -> np.ndarray:

@@ -19,7 +19,6 @@ MAX_NOISE = 1e6
 MAX_THREADS = 1024
 MATMUL_PRECISIONS = ("highest", "high", "medium")
 STRATEGIES = ("beam", "tree", "refine")
-TQC_VALUES = ("mean", "truncated")
 #: Settings of how, not of what, is computed: no preset or trial is about them.
 OF_THE_MACHINE = ("n_threads", "forward_model", "matmul_precision")
 
@@ -56,20 +55,13 @@ class SearchSettings(CheckedSettings):
         the best so far).
     :param n_proposals: actions that are drawn, of which the critics choose those that are simulated.
         ``None``: all that are drawn are simulated.
-    :param common_noise: whether all candidates (in a tree: all nodes of a depth) share the noise of their
-        later actions.
     :param antithetic: whether noise comes in pairs of opposite sign, of candidates and of the simulations of
         one candidate.
     :param branching: children of a node in a tree.
-    :param one_node_per_root: whether a tree keeps only the best node of each root action.
     :param n_rounds: rounds of a refinement.
     :param n_elites: the best plans that a round of a refinement goes on from. ``None``: a quarter of
         ``beam_width``.
     :param min_noise: what the spread of a refinement does not fall below, in the scaled action space.
-    :param entropy_bonus: of SAC and TQC, whether values are soft: every action after the first, the last one
-        included, adds ``-ent_coef * log pi(a|s)``, as in the critics' target. With the strategy ``"beam"``.
-    :param tqc_value: of TQC, ``"mean"`` of all quantiles of all critics, or ``"truncated"``: without the
-        ``top_quantiles_to_drop_per_net`` highest per critic of them all, as in the critics' target.
     :param noise_hold: environment steps in a macro-step, in which all noise stays the same while the policy
         goes on reacting. A rollout simulates ``rollout_depth * noise_hold`` environment steps.
     :param proposal_dims: candidates (of a tree: all children, of a refinement: whole plans) differ only in so
@@ -92,15 +84,11 @@ class SearchSettings(CheckedSettings):
     max_beam_width: int | None = None
     strategy: str = "beam"
     n_proposals: int | None = None
-    common_noise: bool = False
     antithetic: bool = False
     branching: int = 5
-    one_node_per_root: bool = False
     n_rounds: int = 3
     n_elites: int | None = None
     min_noise: float = 0.02
-    entropy_bonus: bool = False
-    tqc_value: str = "mean"
     noise_hold: int = 1
     proposal_dims: int | None = None
 
@@ -123,12 +111,10 @@ class SearchSettings(CheckedSettings):
                 self._set_number(name, MAX_NOISE)
         if self.n_elites is not None:
             self._set_integer("n_elites", 1, self.beam_width)
-        flags = ("include_policy_action", "common_noise", "antithetic", "one_node_per_root", "entropy_bonus")
-        for name in flags:
+        for name in ("include_policy_action", "antithetic"):
             self._check_flag(name)
         self._check_name("forward_model", BACKENDS)
         self._check_name("strategy", STRATEGIES)
-        self._check_name("tqc_value", TQC_VALUES)
         if self.matmul_precision is not None:
             self._check_name("matmul_precision", MATMUL_PRECISIONS, "None")
 
@@ -138,8 +124,6 @@ class SearchSettings(CheckedSettings):
             )
         self._check_strategy()
         self._check_proposals()
-        self._check_common_noise()
-        self._check_entropy_bonus()
         self._check_hierarchy()
         self._check_budget()
         self._check_size()
@@ -177,7 +161,7 @@ class SearchSettings(CheckedSettings):
                 raise ValueError(
                     f"time_budget works with strategy='beam' only, got strategy={self.strategy!r}."
                 )
-            for name in ("n_proposals", "common_noise", "antithetic"):
+            for name in ("n_proposals", "antithetic"):
                 if getattr(self, name):
                     raise ValueError(
                         f"time_budget evaluates candidates in rounds, which {name} does not: leave one of "
@@ -238,34 +222,6 @@ class SearchSettings(CheckedSettings):
             raise ValueError(
                 f"n_proposals must be a multiple of beam_width={self.beam_width} with strategy='tree', since "
                 f"each node proposes equally many; got {self.n_proposals}."
-            )
-
-    def _check_common_noise(self) -> None:
-        if not self.common_noise:
-            return
-        if self.strategy == "refine":
-            raise ValueError(
-                "common_noise has no meaning with strategy='refine': later actions are part of the plan."
-            )
-        # The last action of a rollout has noise too, but a tree's leaves have no later actions.
-        steps = self.rollout_depth - (self.strategy == "tree")
-        if steps == 0 or not self.is_noisy(self.effective_rollout_noise):
-            raise ValueError(
-                "common_noise shares the noise of later actions; there is none with this rollout_depth, "
-                "rollout_noise and noise_clip: leave it out."
-            )
-
-    def _check_entropy_bonus(self) -> None:
-        if not self.entropy_bonus:
-            return
-        if self.rollout_depth == 0:
-            raise ValueError(
-                "entropy_bonus needs a rollout_depth of 1 or more: it is for the actions after the first."
-            )
-        if self.strategy != "beam":
-            raise ValueError(
-                f"entropy_bonus works with strategy='beam' only, got strategy={self.strategy!r}: where later "
-                "actions are chosen by their value, it would favour those that the policy never takes."
             )
 
     def _check_hierarchy(self) -> None:

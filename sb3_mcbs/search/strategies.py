@@ -8,11 +8,11 @@ import numpy as np
 
 from sb3_mcbs.search.beam import beam_search
 from sb3_mcbs.search.interface import Agent, CountedValue, SearchResult
-from sb3_mcbs.search.memory import Moment, PlanMemory
 from sb3_mcbs.search.proposals import draw_noise
 from sb3_mcbs.search.refine import draw_plan_noise, refine_search
 from sb3_mcbs.search.settings import SearchSettings
 from sb3_mcbs.search.tree import draw_tree_noise, tree_search
+from sb3_mcbs.search.warm_start import EpisodeClock, WarmStart
 from sb3_mcbs.types import ForwardModel, Observations
 
 logger = logging.getLogger("sb3_mcbs")
@@ -30,8 +30,7 @@ class Decision(NamedTuple):
     :param rng: of the search: draws all noise, and is given to a model with random dynamics.
     :param memory: of the strategy ``"refine"``.
     :param envs: the environments that decide, by their numbers in the memory.
-    :param moments: the present moment of each, for the memory.
-    :param record: whether the result shall hold the rollouts; of the strategy ``"beam"``.
+    :param clocks: the present moment of each, for the memory.
     :param directions: ``[proposal_dims, act_dim]``, in which candidates differ; ``None``: in all.
     """
 
@@ -42,10 +41,9 @@ class Decision(NamedTuple):
     settings: SearchSettings
     shape: tuple[int, int]
     rng: np.random.Generator
-    memory: PlanMemory | None = None
+    memory: WarmStart | None = None
     envs: Sequence[int] = ()
-    moments: Sequence[Moment] = ()
-    record: bool = False
+    clocks: Sequence[EpisodeClock] = ()
     directions: np.ndarray | None = None
 
 
@@ -88,7 +86,7 @@ def check_dynamics(settings: SearchSettings, deterministic: bool) -> None:
 
 def _beam(decision: Decision) -> SearchResult:
     noise = draw_noise(decision.rng, decision.settings, *decision.shape, directions=decision.directions)
-    return beam_search(*decision[:5], noise, decision.rng, decision.record)
+    return beam_search(*decision[:5], noise, decision.rng)
 
 
 def _tree(decision: Decision) -> SearchResult:
@@ -103,12 +101,12 @@ def _refine(decision: Decision) -> SearchResult:
     noise = draw_plan_noise(decision.rng, decision.settings, *decision.shape)
     hold = decision.settings.noise_hold
     # The present macro-steps need not begin where those of the last decision did.
-    by_step = decision.memory.recall(decision.envs, decision.moments)
+    by_step = decision.memory.recall(decision.envs, decision.clocks)
     remembered = by_step.reshape(len(by_step), -1, hold, by_step.shape[2]).mean(axis=2)
     result, plans = refine_search(
         decision.model, *decision[1:5], noise, decision.rng, remembered, decision.directions
     )
-    decision.memory.keep(np.repeat(plans, hold, axis=1), decision.envs, decision.moments)
+    decision.memory.keep(np.repeat(plans, hold, axis=1), decision.envs, decision.clocks)
     return result
 
 

@@ -100,13 +100,11 @@ def draw_tree_noise(
     width, pairs = settings.beam_width, settings.antithetic
     n_proposals = settings.n_proposals or width * settings.branching
     roots = draw_normal(rng, (n_envs, 1, n_proposals, act_dim), 2 if pairs else None)
-    nodes = 1 if settings.common_noise else width
-    shape = (settings.rollout_depth - 1, n_envs, nodes, n_proposals // width, act_dim)
+    shape = (settings.rollout_depth - 1, n_envs, width, n_proposals // width, act_dim)
     later = low_dimensional(draw_normal(rng, shape, 3 if pairs else None), directions)
     later = scale(later, settings.effective_rollout_noise, settings)
-    everywhere = np.broadcast_to(later, (*shape[:2], width, *shape[3:]))
     roots = scale(low_dimensional(roots, directions), settings.beam_noise, settings)
-    return TreeNoise(roots, everywhere)
+    return TreeNoise(roots, later)
 
 
 def tree_search(
@@ -159,7 +157,7 @@ def tree_search(
         ranking = _join(growth.nodes, _finished(nodes))
         scores = _best_per_root(ranking, n_roots)
         estimates = np.where(np.isfinite(scores), scores, estimates)
-        nodes = _keep_best(ranking, width, settings.one_node_per_root)
+        nodes = _keep_best(ranking, width)
 
     leaves = _best_per_root(nodes, n_roots)
     result = choose(policy_actions, candidates, leaves[..., None], first_step, simulated_steps)
@@ -284,17 +282,15 @@ def _join(left: _Nodes, right: _Nodes) -> _Nodes:
     return _Nodes(*(np.concatenate(pair, axis=-1) for pair in zip(left, right, strict=True)))
 
 
-def _keep_best(nodes: _Nodes, width: int, one_per_root: bool) -> _Nodes:
+def _keep_best(nodes: _Nodes, width: int) -> _Nodes:
     """Keep the best nodes of every environment.
 
     :param width: how many.
-    :param one_per_root: whether the other nodes of a root action go.
     :return: ``width`` slots: the kept nodes in the order in which they were, then empty ones.
     """
-    scores = _only_best_of_root(nodes) if one_per_root else nodes.scores
-    kept = best(scores, width)
+    kept = best(nodes.scores, width)
     # The forward model gathers rows in order, so empty slots go to the end instead of in between.
-    kept_scores = np.take_along_axis(scores, kept, axis=1)
+    kept_scores = np.take_along_axis(nodes.scores, kept, axis=1)
     order = np.argsort(np.isneginf(kept_scores), axis=1, kind="stable")
     kept, kept_scores = (np.take_along_axis(array, order, axis=1) for array in (kept, kept_scores))
     in_simulations = np.broadcast_to(kept[:, None], (*nodes.rows.shape[:2], width))
@@ -305,17 +301,6 @@ def _keep_best(nodes: _Nodes, width: int, one_per_root: bool) -> _Nodes:
         returns=np.take_along_axis(nodes.returns, in_simulations, axis=2),
         rows=np.where(np.isneginf(kept_scores)[:, None], -1, rows),
     )
-
-
-def _only_best_of_root(nodes: _Nodes) -> np.ndarray:
-    """Scores ``[n_envs, slots]`` that are -inf but for the best node of each root action."""
-    order = np.lexsort((-nodes.scores, nodes.roots))
-    sorted_roots = np.take_along_axis(nodes.roots, order, axis=1)
-    is_first = np.ones_like(order, dtype=bool)
-    is_first[:, 1:] = sorted_roots[:, 1:] != sorted_roots[:, :-1]
-    is_best = np.empty_like(is_first)
-    np.put_along_axis(is_best, order, is_first, axis=1)
-    return np.where(is_best, nodes.scores, -np.inf)
 
 
 def _best_per_root(nodes: _Nodes, n_roots: int) -> np.ndarray:

@@ -7,11 +7,11 @@ from typing import Any, Literal
 import numpy as np
 
 from sb3_mcbs.snapshot.errors import SnapshotMismatchError, SnapshotUnsupportedError
-from sb3_mcbs.snapshot.graph import Copier, Freezer, Thawer
+from sb3_mcbs.snapshot.object_graph import Copier, Freezer, Thawer
 from sb3_mcbs.snapshot.tensors import bytes_of, is_tensor
 
 
-class ArrayKind:
+class ArrayHandler:
     """NumPy arrays. A view stays a view of the same array, or of the same object of plain memory."""
 
     name = "array"
@@ -96,7 +96,7 @@ def counterpart(copier: Copier, view: Any) -> Any:
     raise SnapshotUnsupportedError("it is a view into memory that belongs to nothing that is copied")
 
 
-class BytearrayKind:
+class BytearrayHandler:
     """Bytes that can be changed."""
 
     name = "bytearray"

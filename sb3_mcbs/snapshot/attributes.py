@@ -6,8 +6,8 @@ import gymnasium as gym
 
 from sb3_mcbs.snapshot.drawing import stays
 from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
-from sb3_mcbs.snapshot.graph import ATOMIC_CLASSES, MISSING, Freezer, Ref, Thawer
-from sb3_mcbs.snapshot.kinds import kind_of
+from sb3_mcbs.snapshot.handlers import handler_of
+from sb3_mcbs.snapshot.object_graph import ATOMIC_CLASSES, MISSING, Freezer, Ref, Thawer
 from sb3_mcbs.snapshot.objects import attributes_of, set_attributes
 from sb3_mcbs.snapshot.randomness import thaw_np_random
 
@@ -67,7 +67,7 @@ def thaw_attributes(
     for name, value in attributes.items():
         if value is None:
             there = have.get(name)
-            if there is not None and stays(there, kind_of):  # such as a window that was opened since
+            if there is not None and stays(there, handler_of):  # such as a window that was opened since
                 del values[name]
         elif type(value) is Ref and name != "_np_random":
             try:
@@ -90,4 +90,4 @@ def thaw_attributes(
 
 
 def _stays(name: str, value: Any) -> bool:
-    return name == "_np_random" or stays(value, kind_of)
+    return name == "_np_random" or stays(value, handler_of)

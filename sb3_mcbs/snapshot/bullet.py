@@ -33,9 +33,9 @@ from sb3_mcbs.snapshot.bullet_world import (
     write_world,
 )
 from sb3_mcbs.snapshot.errors import SnapshotError, SnapshotMismatchError, SnapshotUnsupportedError
-from sb3_mcbs.snapshot.graph import Freezer, Ref
-from sb3_mcbs.snapshot.kinds import kind_of
+from sb3_mcbs.snapshot.handlers import handler_of
 from sb3_mcbs.snapshot.layers import NOT_STATE, RECORDER
+from sb3_mcbs.snapshot.object_graph import Freezer, Ref
 from sb3_mcbs.snapshot.registry import SnapshotAdapter
 from sb3_mcbs.snapshot.replay import ReplayAdapter, constructor_arguments
 
@@ -241,7 +241,7 @@ def is_server(obj: Any) -> bool:
 
 
 def _refuse_uncapturable(env: Any, not_state: frozenset[str]) -> None:
-    freezer = Freezer(kind_of, {id(env): Ref(0)}, 1)
+    freezer = Freezer(handler_of, {id(env): Ref(0)}, 1)
     freeze_attributes(freezer, env, NOT_STATE | not_state, skip_unsupported=False)
 
 

@@ -16,8 +16,8 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_mcbs.snapshot.bullet_world import is_connected
-from sb3_mcbs.snapshot.graph import ATOMIC_CLASSES
 from sb3_mcbs.snapshot.layers import NOT_STATE, RECORDER
+from sb3_mcbs.snapshot.object_graph import ATOMIC_CLASSES
 from sb3_mcbs.snapshot.objects import attributes_of, is_ordinary, set_attributes
 
 # client, physicsClientId, _physics_client, CLIENT, sim_id, physics_server, but not ownsPhysicsClient: a flag

@@ -11,7 +11,7 @@ from typing import Any
 
 from sb3_mcbs.snapshot.errors import SnapshotMismatchError, SnapshotUnsupportedError
 from sb3_mcbs.snapshot.functions import fingerprint
-from sb3_mcbs.snapshot.graph import MISSING, Copier, Freezer, Thawer, class_name
+from sb3_mcbs.snapshot.object_graph import MISSING, Copier, Freezer, Thawer, class_name
 
 #: Members that Python makes itself, and those that only say what a class is.
 _NOT_STATE = frozenset(
@@ -115,30 +115,30 @@ def is_local(cls: type) -> bool:
     return "<" in cls.__qualname__ and not issubclass(cls, enum.Enum)
 
 
-def is_made_per_instance(cls: type, kind_of: Callable[[Any], Any]) -> bool:
+def is_made_per_instance(cls: type, handler_of: Callable[[Any], Any]) -> bool:
     """Return whether a class has state: it was made inside a function, and holds or closes over some.
 
     :param cls: the class.
-    :param kind_of: the kind of an object; None if it never changes.
+    :param handler_of: the kind of an object; None if it never changes.
     """
-    return _StateSearch(kind_of).is_state(cls)
+    return _StateSearch(handler_of).is_state(cls)
 
 
 class _StateSearch:
     """Looks for state among what a class holds and closes over.
 
-    :param kind_of: the kind of an object; None if it never changes.
+    :param handler_of: the kind of an object; None if it never changes.
     """
 
-    def __init__(self, kind_of: Callable[[Any], Any]) -> None:
-        self._kind_of = kind_of
+    def __init__(self, handler_of: Callable[[Any], Any]) -> None:
+        self._handler_of = handler_of
         self._seen: list[Any] = []  # classes and functions, which may refer to each other
 
     def is_state(self, value: Any) -> bool:
         if isinstance(value, tuple | frozenset):
             return any(map(self.is_state, value))
         if not isinstance(value, type | types.FunctionType):
-            kind = self._kind_of(value)
+            kind = self._handler_of(value)
             return kind is not None and kind.name not in _SHARED_KINDS
         if any(value is one for one in self._seen):
             return False
@@ -188,7 +188,7 @@ def _rebound(code: types.CodeType) -> Iterator[str]:
             yield from _rebound(constant)
 
 
-class LocalClassKind:
+class LocalClassHandler:
     """Other classes that are made inside functions: another instance of the environment may have its own."""
 
     name = "local class"
@@ -203,7 +203,7 @@ class LocalClassKind:
         return obj
 
 
-class ClassKind:
+class ClassHandler:
     """Classes that are made per instance: their attributes, and what their methods close over, are state."""
 
     name = "class"

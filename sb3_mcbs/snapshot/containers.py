@@ -5,10 +5,10 @@ from collections import deque
 from typing import Any
 
 from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
-from sb3_mcbs.snapshot.graph import ATOMIC_CLASSES, MISSING, Copier, Freezer, Ref, Thawer
+from sb3_mcbs.snapshot.object_graph import ATOMIC_CLASSES, MISSING, Copier, Freezer, Ref, Thawer
 
 
-class SequenceKind:
+class SequenceHandler:
     """Lists, tuples, sets and deques."""
 
     name = "sequence"
@@ -108,7 +108,7 @@ def freeze_items(freezer: Freezer, items: Any) -> tuple[Any, ...]:
     return tuple(frozen)
 
 
-class DictKind:
+class DictHandler:
     """Dictionaries."""
 
     name = "dict"

@@ -5,7 +5,7 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-from sb3_mcbs.snapshot.graph import class_name
+from sb3_mcbs.snapshot.object_graph import class_name
 from sb3_mcbs.snapshot.objects import blank
 from sb3_mcbs.snapshot.registry import SnapshotAdapter
 

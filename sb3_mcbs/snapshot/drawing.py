@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
-from sb3_mcbs.snapshot.graph import Copier, Freezer, Thawer, class_name
+from sb3_mcbs.snapshot.object_graph import Copier, Freezer, Thawer, class_name
 from sb3_mcbs.snapshot.pygame_values import is_display, value_class
 
 #: Windows, render contexts and what lies in their memory: whatever is there stays, a copy has none.
@@ -63,7 +63,7 @@ def kind_name(cls: type, name: str) -> str | None:
     return "window" if is_artist or name.startswith(_WINDOWS) else None
 
 
-class DrawnKind:
+class DrawnHandler:
     """What is drawn in a window and keeps its place there: refused."""
 
     name = "drawn"
@@ -81,13 +81,13 @@ class DrawnKind:
         return self.freeze(Freezer(lambda _: None, {}, 0), obj)
 
 
-def stays(obj: Any, kind_of: Callable[[Any], Any]) -> bool:
+def stays(obj: Any, handler_of: Callable[[Any], Any]) -> bool:
     """Return whether an object is no state: it stays where it is, whatever was there before.
 
     :param obj: any object.
-    :param kind_of: the kind of an object; None if it never changes.
+    :param handler_of: the kind of an object; None if it never changes.
     """
-    kind = kind_of(obj)
+    kind = handler_of(obj)
     if kind is None:
         return False
     return kind.name in ("constant", "window") or (kind.name == "surface" and is_display(obj))

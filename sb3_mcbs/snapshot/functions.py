@@ -7,7 +7,7 @@ import types
 from typing import Any
 
 from sb3_mcbs.snapshot.errors import SnapshotMismatchError, SnapshotUnsupportedError
-from sb3_mcbs.snapshot.graph import ATOMIC_CLASSES, MISSING, Copier, Freezer, Thawer
+from sb3_mcbs.snapshot.object_graph import ATOMIC_CLASSES, MISSING, Copier, Freezer, Thawer
 from sb3_mcbs.snapshot.stand_ins import bound, function_of
 
 _EMPTY = ("empty",)
@@ -81,7 +81,7 @@ class FunctionName:
         return self.function
 
 
-class FunctionKind:
+class FunctionHandler:
     """Python functions: their code is fixed; what they close over, their defaults and attributes are state.
 
     Of a function that its module names, defaults and attributes are global, and so is what it closes over if
@@ -226,7 +226,7 @@ def _with_cells(function: types.FunctionType, cells: tuple[types.CellType, ...])
     return made
 
 
-class CellKind:
+class CellHandler:
     """The variables that functions close over."""
 
     name = "cell"
@@ -271,7 +271,7 @@ def _content(cell: Any) -> Any:
         return MISSING
 
 
-class MethodKind:
+class MethodHandler:
     """Methods bound to an object."""
 
     name = "method"
@@ -289,7 +289,7 @@ class MethodKind:
         return bound(copier.copy(function_of(obj)), copier.copy(obj.__self__))
 
 
-class BuiltinMethodKind:
+class BuiltinMethodHandler:
     """Compiled functions, and methods of compiled classes such as ``Generator.normal``."""
 
     name = "builtin"

@@ -64,7 +64,7 @@ def bits_of(generator: Any) -> Any:
 
 
 @functools.lru_cache(maxsize=64)
-def kind_of(classes: tuple[type, type]) -> str:
+def pair_name(classes: tuple[type, type]) -> str:
     """Name the kind; states can be exchanged between generators of one kind.
 
     :param classes: what :func:`classes_of` returned for a generator.
@@ -78,9 +78,9 @@ def is_of_kind(obj: Any, kind: str) -> bool:
     """Return whether an object is a generator of a kind.
 
     :param obj: any object.
-    :param kind: what :func:`kind_of` returned.
+    :param kind: what :func:`pair_name` returned.
     """
-    return is_generator(obj) and kind_of(classes_of(obj)) == kind
+    return is_generator(obj) and pair_name(classes_of(obj)) == kind
 
 
 def sequence_of(generator: Any) -> np.random.SeedSequence | None:

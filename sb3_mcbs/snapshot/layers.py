@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 from gymnasium import spaces
 
-from sb3_mcbs.snapshot.graph import class_name
+from sb3_mcbs.snapshot.object_graph import class_name
 from sb3_mcbs.snapshot.stand_ins import MONITOR, StandIn, left_out_class, set_by
 
 #: Attributes of a layer that say how it was made or how it is drawn.

@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 
 from sb3_mcbs.snapshot.containers import freeze_items, refill_dict
 from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
-from sb3_mcbs.snapshot.graph import MISSING, Copier, Freezer, Ref, Thawer, class_name
+from sb3_mcbs.snapshot.object_graph import MISSING, Copier, Freezer, Ref, Thawer, class_name
 
 
-class ObjectKind:
+class ObjectHandler:
     """Objects of ordinary Python classes: their attributes are their state."""
 
     name = "object"
@@ -152,7 +152,7 @@ def _made_anew(thawer: Thawer, index: int, cls: type, attributes: Any, have: dic
 def _is_hashed(walker: Thawer | Copier, value: Any) -> bool:
     """Return whether an attribute holds what hashes are computed from: a constant, or a tuple of some."""
     if isinstance(walker, Copier):
-        return type(value) in (tuple, frozenset) or walker.kind_of(value) is None
+        return type(value) in (tuple, frozenset) or walker.handler_of(value) is None
     if type(value) is not Ref:
         return True
     kind, payload = walker.nodes[value.index]
@@ -216,7 +216,7 @@ def set_attributes(obj: Any, values: dict[str, Any], gone: Iterable[str] = ()) -
             own[name] = value  # type: ignore[index]
 
 
-class ReducedKind:
+class ReducedHandler:
     """Objects of compiled classes that say themselves what they are made of, as for pickling."""
 
     name = "reduced"

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_mcbs.snapshot.graph import MISSING, Copier, Freezer, Thawer, class_name
+from sb3_mcbs.snapshot.object_graph import MISSING, Copier, Freezer, Thawer, class_name
 from sb3_mcbs.snapshot.objects import copy_content, freeze_content, thaw_content
 
 _SURFACE = "pygame.surface.Surface"
@@ -74,7 +74,7 @@ def _make(cls: type, *arguments: Any) -> Any:
     return made
 
 
-class PygameKind:
+class PygameHandler:
     """Objects that consist of few numbers or bits, besides the attributes of those of derived classes."""
 
     name = "pygame"
@@ -110,7 +110,7 @@ def _class_of(cls: type) -> _Class:
     return _CLASSES[class_name(known)]
 
 
-class SurfaceKind:
+class SurfaceHandler:
     """Surfaces: their pixels, or their place in a larger one. What is shown on the display is no state.
 
     One that has the captured pixels already stays: most are pictures that nobody draws on.
@@ -182,8 +182,15 @@ def _format(surface: Any) -> tuple[Any, ...]:
     )
 
 
+def _rows(surface: Any) -> np.ndarray:
+    """The bytes of the pixels, without those between rows: ``[height, bytes of a row]``, a view."""
+    memory = np.frombuffer(surface.get_buffer(), dtype=np.uint8)
+    rows = memory[: surface.get_height() * surface.get_pitch()].reshape(surface.get_height(), -1)
+    return rows[:, : surface.get_width() * surface.get_bytesize()]
+
+
 def _pixels(surface: Any) -> bytes:
-    return surface.get_buffer().raw
+    return _rows(surface).tobytes()
 
 
 def _is_same(surface: Any, form: Any, pixels: bytes | None, parent: Any) -> bool:
@@ -204,7 +211,9 @@ def _draw(surface: Any, form: Any, pixels: bytes | None) -> None:
     if pixels is not None:
         if form.palette is not None:
             surface.set_palette(form.palette)
-        surface.get_buffer().write(pixels, 0)
+        # Rows of surfaces of the same size may lie differently far apart in memory.
+        rows = _rows(surface)
+        rows[:] = np.frombuffer(pixels, dtype=np.uint8).reshape(rows.shape)
     accelerated = form.flags & sys.modules["pygame"].RLEACCEL
     surface.set_colorkey(form.colorkey, accelerated)
     surface.set_alpha(form.alpha, accelerated)

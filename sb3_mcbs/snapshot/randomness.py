@@ -6,13 +6,13 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_mcbs.snapshot import generators
-from sb3_mcbs.snapshot.graph import MISSING, Copier, Freezer, Ref, Thawer
+from sb3_mcbs.snapshot.object_graph import MISSING, Copier, Freezer, Ref, Thawer
 from sb3_mcbs.snapshot.spaces import definition_of, is_defined_as, made_of, parts_of
 
 _GLOBAL = "global"
 
 
-class GeneratorKind:
+class GeneratorHandler:
     """Random generators, with the sequences that they spawn from. Those of the process are no state."""
 
     name = "generator"
@@ -23,7 +23,7 @@ class GeneratorKind:
             return _GLOBAL, global_name, None, None
         bits = generators.bits_of(obj)
         classes = type(obj), type(bits)
-        kind = generators.kind_of(classes)
+        kind = generators.pair_name(classes)
         shared = freezer.owner_of(bits, obj)
         if shared is not None:
             return kind, classes, shared, None
@@ -101,7 +101,7 @@ def _over(bits: Any, classes: tuple[type, type], current: Any) -> Any:
     return classes[0](bits)
 
 
-class SeedsKind:
+class SeedsHandler:
     """Sequences that random generators are spawned from."""
 
     name = "seeds"
@@ -132,7 +132,7 @@ def _reseed_sequence(
     generators.reseed_sequence(sequence, seeds, int(rng.integers(2**63)))
 
 
-class SpaceKind:
+class SpaceHandler:
     """Spaces: what they contain is state, as environments may exchange them, and so are their generators.
 
     A space that is still the same stays where it is: others hold it, too.

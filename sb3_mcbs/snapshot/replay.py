@@ -12,9 +12,9 @@ from gymnasium.envs.registration import load_env_creator
 
 from sb3_mcbs.snapshot.attributes import freeze_attributes, thaw_attributes
 from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
-from sb3_mcbs.snapshot.graph import Freezer, Node, Ref, Thawer, private_copy
-from sb3_mcbs.snapshot.kinds import KINDS, kind_of
+from sb3_mcbs.snapshot.handlers import HANDLERS, handler_of
 from sb3_mcbs.snapshot.layers import NOT_STATE, RECORDER
+from sb3_mcbs.snapshot.object_graph import Freezer, Node, Ref, Thawer, private_copy
 from sb3_mcbs.snapshot.registry import SnapshotAdapter
 
 
@@ -104,7 +104,7 @@ class Recorder:
 
         :param arguments: of the reset that follows.
         """
-        freezer = Freezer(kind_of, {id(self.env): Ref(0)}, 1)
+        freezer = Freezer(handler_of, {id(self.env): Ref(0)}, 1)
         attributes = freeze_attributes(freezer, self.env, self._not_state, skip_unsupported=True)
         self.episode = Episode(attributes, tuple(freezer.nodes), private_copy(arguments), ())
         self.actions = []
@@ -115,7 +115,7 @@ class Recorder:
 
         :param episode: what to repeat.
         """
-        thawer = Thawer(episode.nodes, KINDS, [self.env], "restore")
+        thawer = Thawer(episode.nodes, HANDLERS, [self.env], "restore")
         thaw_attributes(thawer, self.env, self._not_state, episode.attributes, delete_others=False)
         thawer.commit()
         render_mode, self.env.render_mode = self.env.render_mode, None

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from sb3_mcbs.snapshot.graph import ATOMIC_CLASSES
+from sb3_mcbs.snapshot.object_graph import ATOMIC_CLASSES
 
 #: A space's class, and its attributes without its generator. Spaces in it are definitions themselves.
 Definition = tuple[type, tuple[tuple[str, Any], ...]]

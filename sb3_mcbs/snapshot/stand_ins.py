@@ -8,7 +8,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from sb3_mcbs.snapshot.graph import class_name
+from sb3_mcbs.snapshot.object_graph import class_name
 
 MONITOR = "stable_baselines3.common.monitor.Monitor"
 _LEFT_OUT = frozenset(

@@ -13,9 +13,9 @@ from sb3_mcbs.snapshot.attributes import freeze_attributes, thaw_attributes
 from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
 from sb3_mcbs.snapshot.functions import is_own
 from sb3_mcbs.snapshot.global_generators import globals_kept
-from sb3_mcbs.snapshot.graph import Copier, Freezer, Node, Ref, RngMode, Thawer
-from sb3_mcbs.snapshot.kinds import KINDS, kind_of, plan_adapter
+from sb3_mcbs.snapshot.handlers import HANDLERS, handler_of, plan_adapter
 from sb3_mcbs.snapshot.layers import OF_ONE_MONITOR, Layer, layers_of
+from sb3_mcbs.snapshot.object_graph import Copier, Freezer, Node, Ref, RngMode, Thawer
 from sb3_mcbs.snapshot.objects import attributes_of, blank, set_attributes
 from sb3_mcbs.snapshot.pairing import FrozenLayer, check, pair
 from sb3_mcbs.snapshot.places import Places
@@ -130,7 +130,7 @@ class Stack:
         :raises SnapshotUnsupportedError: if a layer holds something that cannot be captured.
         """
         while True:
-            freezer = Freezer(kind_of, self._refs, len(self.layers), Places(self._watched or ()))
+            freezer = Freezer(handler_of, self._refs, len(self.layers), Places(self._watched or ()))
             frozen = tuple([self._freeze_layer(freezer, layer, monitor) for layer in self.layers])
             self._watch(freezer.adapted)
             if freezer.places.are_of(freezer.adapted):
@@ -233,7 +233,7 @@ class Stack:
                 known[place] = known[place + 1]
         places = Places(self._watched or ())
         while True:
-            thawer = Thawer(nodes, KINDS, known, rng, originals, places, foreign)
+            thawer = Thawer(nodes, HANDLERS, known, rng, originals, places, foreign)
             self._plan(thawer, layers, frozen)
             simulators = [thawer.adapted[index] for index in sorted(thawer.adapted)]
             if places.are_of(simulators):
@@ -260,7 +260,7 @@ class Stack:
         :return: the outermost layer of the copy.
         """
         copies: dict[int, Any] = {}
-        copier = Copier(kind_of, copies)
+        copier = Copier(handler_of, copies)
         ordinary: list[Layer] = []
         for layer in reversed(self.layers):
             adapter = self._adapters.get(id(layer.env))
@@ -273,7 +273,7 @@ class Stack:
                     copies[id(layer.env)] = adapter.clone(layer.env, copier.copy)
         outermost = copies[id(self._owner)] = copies[id(self.layers[0].env)]
         # Simulators first, wherever they hang: attributes may be views into their memory.
-        freezer = Freezer(kind_of, self._refs, len(self.layers))
+        freezer = Freezer(handler_of, self._refs, len(self.layers))
         frozen = [self._freeze_layer(freezer, layer, monitor=False) for layer in ordinary]
         if not self.incomplete_clones:  # those are completed by what keep() has checked
             check_held(freezer, frozen)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
-from sb3_mcbs.snapshot.graph import MISSING, Copier, Freezer, Ref, Thawer, class_name
+from sb3_mcbs.snapshot.object_graph import MISSING, Copier, Freezer, Ref, Thawer, class_name
 from sb3_mcbs.snapshot.objects import copy_content, freeze_content, thaw_content
 
 
@@ -33,7 +33,7 @@ def _whole(tensor: Any) -> Any:
     return torch.empty(0, dtype=torch.uint8, device=tensor.device).set_(tensor.untyped_storage())
 
 
-class TensorKind:
+class TensorHandler:
     """Tensors and parameters. Parameters are put back in place: optimizers hold them as well."""
 
     name = "torch"

@@ -18,8 +18,8 @@ import numpy as np
 
 from sb3_mcbs.snapshot.errors import SnapshotError, SnapshotMismatchError, SnapshotUnsupportedError
 from sb3_mcbs.snapshot.global_generators import globals_kept, seed_globals
-from sb3_mcbs.snapshot.graph import private_copy
 from sb3_mcbs.snapshot.layers import Layer, replaced_method
+from sb3_mcbs.snapshot.object_graph import private_copy
 from sb3_mcbs.snapshot.objects import attributes_of
 from sb3_mcbs.snapshot.registry import SnapshotAdapter, find_adapter
 from sb3_mcbs.snapshot.spaces import random_action

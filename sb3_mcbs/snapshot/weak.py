@@ -5,12 +5,12 @@ from collections.abc import Iterable
 from typing import Any
 
 from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
-from sb3_mcbs.snapshot.graph import MISSING, Copier, Freezer, Ref, Thawer, class_name
+from sb3_mcbs.snapshot.object_graph import MISSING, Copier, Freezer, Ref, Thawer, class_name
 
 PROXIES = (weakref.ProxyType, weakref.CallableProxyType)
 
 
-class ProxyKind:
+class ProxyHandler:
     """Weak proxies."""
 
     name = "proxy"
@@ -43,7 +43,7 @@ class _Gone:
     """Of which nothing is left."""
 
 
-class WeakrefKind:
+class WeakrefHandler:
     """Weak references. What they stand for must be held by the environment: see :func:`check_held`."""
 
     name = "weakref"

@@ -11,8 +11,8 @@ import numpy as np
 
 from sb3_mcbs.snapshot.errors import SnapshotError, SnapshotMismatchError, SnapshotUnsupportedError
 from sb3_mcbs.snapshot.faults import diverged_step
-from sb3_mcbs.snapshot.graph import Node, RngMode, private_copy
 from sb3_mcbs.snapshot.layers import describe_space
+from sb3_mcbs.snapshot.object_graph import Node, RngMode, private_copy
 from sb3_mcbs.snapshot.pairing import FrozenLayer
 from sb3_mcbs.snapshot.pygame_values import display_kept
 from sb3_mcbs.snapshot.replay import Box2DAdapter
@@ -70,7 +70,7 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
     #: What the last reset or step returned, None before the first reset. Not to be altered.
     last_observation: Any
     #: How often the environment was reset or restored, and the steps since then. Not part of snapshots.
-    moment: tuple[int, int]
+    episode_clock: tuple[int, int]
     #: The seed and the options of the last reset; the last seed that was given. Not part of snapshots.
     reset_arguments: dict[str, Any]
     #: Whether the environment is checked, if it is not known to be exact.
@@ -92,7 +92,7 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
         gym.utils.RecordConstructorArgs.__init__(self, verify=verify)
         gym.Wrapper.__init__(self, env)
         self.last_observation = None
-        self.moment = (0, 0)
+        self.episode_clock = (0, 0)
         self.reset_arguments = {"seed": None, "options": None}
         self._known_stack: Stack | None = Stack(self)
         # One below may say so, and be below a Monitor by now.
@@ -160,7 +160,7 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
         _ = self._stack  # adapters prepare the environment
         observation, info = self.env.reset(seed=seed, options=options)
         self.last_observation = private_copy(observation)
-        self.moment = (self.moment[0] + 1, 0)
+        self.episode_clock = (self.episode_clock[0] + 1, 0)
         self._stack.find_simulators()
         return observation, info
 
@@ -209,7 +209,7 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
             forget_the_past()
         result = self.env.step(action)
         self.last_observation = private_copy(result[0])
-        self.moment = (self.moment[0], self.moment[1] + 1)
+        self.episode_clock = (self.episode_clock[0], self.episode_clock[1] + 1)
         for diverged in watches:
             if diverged():
                 return diverged_step(result, self._stack.monitors)
@@ -251,7 +251,7 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
                 )
         self._stack.thaw(snapshot.layers, snapshot.nodes, rng)
         self.last_observation = private_copy(snapshot.last_observation)
-        self.moment = (self.moment[0] + 1, 0)
+        self.episode_clock = (self.episode_clock[0] + 1, 0)
 
     @property
     def simulators(self) -> list[Any]:

@@ -13,7 +13,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_mcbs.agents.hyperparameters import SETTING_NAMES, settings_of_preset
+from sb3_mcbs.agents.hyperparameters import REMOVED, SETTING_NAMES, refuse_removed, settings_of_preset
 from sb3_mcbs.agents.registry import SEARCHING
 from sb3_mcbs.agents.schedule import SCHEDULES, UNITS
 from sb3_mcbs.checkpoints import CheckpointError, ExactCheckpointCallback
@@ -21,7 +21,7 @@ from sb3_mcbs.checkpoints.resume import continue_with
 from sb3_mcbs.checkpoints.resumption import Resumption
 from sb3_mcbs.models import ForwardModelError
 from sb3_mcbs.search import PRESETS, SearchSettings, with_preset
-from sb3_mcbs.search.settings import MATMUL_PRECISIONS, STRATEGIES, TQC_VALUES
+from sb3_mcbs.search.settings import MATMUL_PRECISIONS, STRATEGIES
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 from sb3_mcbs.types import BACKENDS
 from sb3_mcbs.zoo.callbacks import SearchEvalCallback, SecondEvalCallback
@@ -38,7 +38,6 @@ CHECKPOINTS = "checkpoints"
 NAMES = {
     "preset": tuple(PRESETS),
     "strategy": STRATEGIES,
-    "tqc_value": TQC_VALUES,
     "forward_model": BACKENDS,
     "matmul_precision": MATMUL_PRECISIONS,
     "search_schedule": SCHEDULES,
@@ -204,6 +203,8 @@ def _check_names(custom: dict[str, Any]) -> None:
     :param custom: hyperparameters of the command line.
     """
     for name, value in custom.items():
+        if name in REMOVED:
+            sys.exit(f"-params {name}:{value}: {name} was removed: {REMOVED[name][1]}.")
         if not isinstance(value, str) or name not in {"preset", *SETTING_NAMES}:
             continue
         if name not in NAMES:
@@ -230,6 +231,7 @@ def _checked_search_evaluation(settings: Any, algo: str) -> dict[str, Any]:
         )
     settings = dict(settings)
     settings = with_preset(settings.pop("preset", None), settings)
+    refuse_removed(settings)
     unknown = sorted(set(settings) - set(SearchSettings.names()))
     if unknown:
         raise ValueError(

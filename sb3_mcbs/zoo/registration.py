@@ -10,22 +10,20 @@ import re
 import sys
 from collections.abc import Callable
 from functools import partial
-from types import CodeType, ModuleType
+from types import ModuleType
 from typing import Any
 
 import gymnasium as gym
 from stable_baselines3.common import env_util
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_mcbs.agents.hyperparameters import SETTING_NAMES
+from sb3_mcbs.agents.hyperparameters import REMOVED, SETTING_NAMES
 from sb3_mcbs.agents.registry import SEARCHING
 from sb3_mcbs.zoo.sampler import convert_mcbs_params, sample_mcbs_params
 
-#: By these names, and others beside them, RL Zoo's commands know the algorithms that have a replay buffer.
-OFF_POLICY = frozenset(("ddpg", "sac", "td3", "tqc"))
 #: Hyperparameters whose values may be names, which need no quotes on the command line.
 NAMED = frozenset(
-    ("preset", *SETTING_NAMES, "policy", "noise_type", "env_wrapper", "vec_env_wrapper", "callback")
+    ("preset", *SETTING_NAMES, *REMOVED, "policy", "noise_type", "env_wrapper", "vec_env_wrapper", "callback")
 )
 #: What MuJoCo says whenever it reads HalfCheetah's XML, which is Gymnasium's and nobody here can change.
 DEPRECATION = "compiler attribute 'settotalmass' is deprecated"
@@ -159,33 +157,8 @@ def _add_manager(exp_manager: Any) -> None:
             module.ExperimentManager = subclass  # type: ignore[union-attr]
 
 
-def with_our_off_policy_names(code: CodeType) -> CodeType:
-    """
-    Add our algorithms to those that a command of RL Zoo loads with a replay buffer of one row.
-
-    ``enjoy``, ``record_video`` and ``push_to_hub`` only show an agent. They hold the names of the algorithms
-    that have a replay buffer in a list within their code; there is no other place to add to.
-
-    :param code: of the command, or of one of its functions
-    :return: the same code with the longer list; unchanged if it has none, or ours is there
-    """
-    constants: list[Any] = []
-    for constant in code.co_consts:
-        if isinstance(constant, CodeType):
-            constant = with_our_off_policy_names(constant)
-        elif isinstance(constant, tuple) and OFF_POLICY.issubset(constant):
-            constant = (*constant, *(name for name in SEARCHING if name not in constant))
-        constants.append(constant)
-    return code.replace(co_consts=tuple(constants))
-
-
-def _extend_enjoy(enjoy: Any) -> None:
-    enjoy.enjoy.__code__ = with_our_off_policy_names(enjoy.enjoy.__code__)
-
-
 _PATCHES: dict[str, Callable[[Any], None]] = {
     "rl_zoo3.utils": _add_algorithms,
     "rl_zoo3.hyperparams_opt": _add_samplers,
     "rl_zoo3.exp_manager": _add_manager,
-    "rl_zoo3.enjoy": _extend_enjoy,
 }

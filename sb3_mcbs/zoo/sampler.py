@@ -14,13 +14,12 @@ from typing import Any
 
 import optuna
 
-from sb3_mcbs.agents.hyperparameters import SETTING_NAMES
-from sb3_mcbs.agents.rollout_replay import RolloutReplaySettings
+from sb3_mcbs.agents.hyperparameters import REMOVED, SETTING_NAMES
 from sb3_mcbs.agents.schedule import SCHEDULES, UNITS, ScheduleSettings
 from sb3_mcbs.agents.value_expansion import ValueExpansionSettings
 from sb3_mcbs.search import SearchSettings
 from sb3_mcbs.search.checks import CheckedSettings
-from sb3_mcbs.search.settings import OF_THE_MACHINE, TQC_VALUES
+from sb3_mcbs.search.settings import OF_THE_MACHINE
 
 SWITCH = "SB3_MCBS_TUNE"
 SCOPES = ("search", "strategies", "schedules", "all")
@@ -38,7 +37,6 @@ PROPOSAL_DIMS = (None, 1, 2, 3)
 SEARCH_SHARES = (0.25, 0.5, 1.0)
 #: As parts of ``search_share``.
 FINAL_SEARCH_SHARES = (0.0, 0.2, 0.5)
-ROLLOUT_REPLAY = (0.0, 0.25, 0.5)
 VALUE_EXPANSION = (0, 1, 2, 4)
 
 #: A trial whose decisions cost more simulated steps than this would take days.
@@ -96,7 +94,7 @@ def sample_mcbs_params(
     if scope == "strategies" or simulations_differ:
         sampled["n_simulations"] = trial.suggest_categorical("n_simulations", N_SIMULATIONS)
     if scope == "strategies":
-        sampled |= _sample_strategy(trial, base, sampled["rollout_depth"])
+        sampled |= _sample_strategy(trial)
     if scope == "schedules":
         sampled |= _sample_schedule(trial)
     params = _search_settings(sampled)
@@ -111,7 +109,7 @@ def sample_mcbs_params(
     return {**params, **_NO_PRESET}
 
 
-def _sample_strategy(trial: optuna.Trial, base: str, rollout_depth: int) -> dict[str, Any]:
+def _sample_strategy(trial: optuna.Trial) -> dict[str, Any]:
     """Draw how to search, by the names that the trial stores."""
     strategy = trial.suggest_categorical("strategy", STRATEGIES)
     sampled: dict[str, Any] = {
@@ -122,17 +120,12 @@ def _sample_strategy(trial: optuna.Trial, base: str, rollout_depth: int) -> dict
         "proposal_dims": trial.suggest_categorical("proposal_dims", PROPOSAL_DIMS),
     }
     if strategy == "beam":
-        for name in ("noise_free_rollouts", "include_policy_action", "common_noise"):
+        for name in ("noise_free_rollouts", "include_policy_action"):
             sampled[name] = trial.suggest_categorical(name, (False, True))
-        if base in ("sac", "tqc") and rollout_depth:
-            sampled["entropy_bonus"] = trial.suggest_categorical("entropy_bonus", (False, True))
     elif strategy == "tree":
         sampled["branching"] = trial.suggest_categorical("branching", BRANCHING)
-        sampled["one_node_per_root"] = trial.suggest_categorical("one_node_per_root", (False, True))
     else:
         sampled["n_rounds"] = trial.suggest_categorical("n_rounds", N_ROUNDS)
-    if base == "tqc":
-        sampled["tqc_value"] = trial.suggest_categorical("tqc_value", TQC_VALUES)
     return sampled
 
 
@@ -142,7 +135,6 @@ def _sample_schedule(trial: optuna.Trial) -> dict[str, Any]:
         "search_schedule": trial.suggest_categorical("search_schedule", SCHEDULES),
         "search_share": trial.suggest_categorical("search_share", SEARCH_SHARES),
         "search_unit": trial.suggest_categorical("search_unit", UNITS),
-        "rollout_replay": trial.suggest_categorical("rollout_replay", ROLLOUT_REPLAY),
         "value_expansion": trial.suggest_categorical("value_expansion", VALUE_EXPANSION),
     }
     if sampled["search_schedule"] != "constant":
@@ -180,10 +172,8 @@ def _why_senseless(params: dict[str, Any], sampled: dict[str, Any], n_actions: i
     try:
         settings = SearchSettings(**_of(params, SearchSettings))
         ScheduleSettings(**_of(params, ScheduleSettings)).check_search(settings)
-        replay = RolloutReplaySettings(**_of(params, RolloutReplaySettings))
-        replay.check_search(settings)
         expansion = ValueExpansionSettings(**_of(params, ValueExpansionSettings))
-        expansion.check_search(settings, replay.rollout_replay)
+        expansion.check_search(settings)
         expansion.check_buffer(params.get("optimize_memory_usage", False))
     except ValueError as error:
         return str(error)
@@ -203,7 +193,7 @@ def convert_mcbs_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     :param sampled_params: ``trial.params``
     :return: constructor arguments, as the sampler returned them
     """
-    search_names = {*_HELPERS, *SETTING_NAMES}
+    search_names = {*_HELPERS, *SETTING_NAMES, *REMOVED}
     search = _search_settings({name: v for name, v in sampled_params.items() if name in search_names})
     search |= _NO_PRESET
     others = {name: value for name, value in sampled_params.items() if name not in search_names}

@@ -4,10 +4,10 @@ from typing import Literal, get_args
 
 import numpy as np
 
-Purpose = Literal["schedule", "rollout replay", "learned model"]
+Purpose = Literal["schedule", "value expansion", "learned model"]
 
 
-def stream(seed: int | None, purpose: Purpose) -> np.random.Generator:
+def spawn_rng(seed: int | None, purpose: Purpose) -> np.random.Generator:
     """Make a generator that has nothing in common with an environment of this seed, or with another purpose.
 
     ``np.random.default_rng(seed)`` is the generator of an environment that was reset with that seed: a

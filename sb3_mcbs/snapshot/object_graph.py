@@ -2,7 +2,7 @@
 
 An environment's attributes form a graph: wrappers refer to each other, arrays are shared, functions
 close over objects. The three classes here walk it, each with a memo, so that what was shared stays
-shared. What is done with one object is decided by its kind (:mod:`sb3_mcbs.snapshot.kinds`).
+shared. What is done with one object is decided by its handler (:mod:`sb3_mcbs.snapshot.handlers`).
 """
 
 import copy as copy_module
@@ -51,8 +51,8 @@ class Ref:
         return Ref, (self.index,)
 
 
-class Kind(Protocol):
-    """What is done with the objects of one kind."""
+class TypeHandler(Protocol):
+    """Captures, restores and copies the objects of some types."""
 
     name: str
 
@@ -72,7 +72,7 @@ Node = tuple[str, Any]
 class Freezer:
     """Turns values into frozen values and nodes.
 
-    :param kind_of: the kind of an object; None for objects that never change and stand for themselves.
+    :param handler_of: the handler of an object; None for objects that never change and stand for themselves.
     :param known: id of an object -> the node it is, for objects that are named rather than captured.
     :param n_known: how many nodes those are, the first ones.
     :param places: names views into simulators.
@@ -80,7 +80,7 @@ class Freezer:
 
     def __init__(
         self,
-        kind_of: Callable[[Any], Kind | None],
+        handler_of: Callable[[Any], TypeHandler | None],
         known: dict[int, Ref],
         n_known: int,
         places: Places | None = None,
@@ -95,7 +95,7 @@ class Freezer:
         self.tensors: list[Any] = []
         #: Whether weak references were.
         self.weak = False
-        self._kind_of = kind_of
+        self._handler_of = handler_of
         self._memo = dict(known)
         self._owners: dict[int, Ref] = {}
         # An id is only unique among objects that live, and some parts of objects are temporary.
@@ -107,7 +107,7 @@ class Freezer:
         :param value: any value that an environment holds.
         :raises SnapshotUnsupportedError: if part of it cannot be captured.
         """
-        if type(value) in ATOMIC_CLASSES or (kind := self._kind_of(value)) is None:
+        if type(value) in ATOMIC_CLASSES or (handler := self._handler_of(value)) is None:
             return value
         ref = self._memo.get(id(value))
         if ref is not None:
@@ -116,7 +116,7 @@ class Freezer:
         self.nodes.append(("pending", None))
         self.objects.append(value)
         try:
-            self.nodes[ref.index] = (kind.name, kind.freeze(self, value))
+            self.nodes[ref.index] = (handler.name, handler.freeze(self, value))
         except (SnapshotError, RecursionError):
             raise
         except Exception as error:
@@ -160,7 +160,7 @@ class Thawer:
     """Turns frozen values back into objects, without changing anything until :meth:`commit`.
 
     :param nodes: the nodes that the frozen values refer to.
-    :param kinds: kinds by name.
+    :param handlers: by name.
     :param known: the objects that stand for the first nodes, in order.
     :param rng: what happens to random generators: "restore", "keep", or a generator to seed them from.
     :param originals: the objects that the nodes were made of, if those are to be put back themselves.
@@ -171,7 +171,7 @@ class Thawer:
     def __init__(
         self,
         nodes: tuple[Node, ...],
-        kinds: dict[str, Kind],
+        handlers: dict[str, TypeHandler],
         known: list[Any],
         rng: RngMode,
         originals: list[Any] | None = None,
@@ -188,7 +188,7 @@ class Thawer:
         self.in_place = originals is not None
         self.memo: dict[int, Any] = dict(enumerate(known))
         self.nodes = nodes
-        self._kinds = kinds
+        self._handlers = handlers
         self._claimed: set[int] = {id(obj) for obj in known}
         self._first: list[tuple[Any, ...]] = []
         self._then: list[tuple[Any, ...]] = []
@@ -209,7 +209,7 @@ class Thawer:
         if self._originals is not None:
             current = self._originals[index]
         try:
-            thawed = self.memo[index] = self._kinds[name].thaw(self, index, payload, current)
+            thawed = self.memo[index] = self._handlers[name].thaw(self, index, payload, current)
         except SnapshotError:
             raise
         except Exception as error:
@@ -259,14 +259,14 @@ class Thawer:
 class Copier:
     """Copies values, keeping what is shared among them shared among the copies.
 
-    :param kind_of: the kind of an object; None for objects that never change.
+    :param handler_of: the handler of an object; None for objects that never change.
     :param known: id of an object -> what stands in its place in the copy.
     """
 
-    def __init__(self, kind_of: Callable[[Any], Kind | None], known: dict[int, Any]) -> None:
+    def __init__(self, handler_of: Callable[[Any], TypeHandler | None], known: dict[int, Any]) -> None:
         self.memo = known
         self.adapted: list[tuple[Any, Any, Any]] = []
-        self.kind_of = kind_of
+        self.handler_of = handler_of
         self.alive: list[Any] = []
 
     def copy(self, value: Any) -> Any:
@@ -275,14 +275,14 @@ class Copier:
         :param value: any value that an environment holds.
         :raises SnapshotUnsupportedError: if part of it cannot be copied.
         """
-        if type(value) in ATOMIC_CLASSES or (kind := self.kind_of(value)) is None:
+        if type(value) in ATOMIC_CLASSES or (handler := self.handler_of(value)) is None:
             return value
         key = id(value)
         if key not in self.memo:
             self.alive.append(value)
             try:
-                # The kind enters it in the memo as well if the object can refer to itself.
-                self.memo[key] = kind.copy(self, value)
+                # The handler enters it in the memo as well if the object can refer to itself.
+                self.memo[key] = handler.copy(self, value)
             except SnapshotError:
                 raise
             except Exception as error:

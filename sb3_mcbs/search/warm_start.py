@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 
 #: When a decision was made: how often its environment had been reset or restored, and the steps since then.
-Moment = tuple[int, int]
+EpisodeClock = tuple[int, int]
 
 
-class PlanMemory:
+class WarmStart:
     """The plan that was followed last in every environment.
 
     A plan is for the steps right after its decision. It is recalled for what is left of it then, and not at
@@ -22,9 +22,9 @@ class PlanMemory:
 
     def __init__(self, n_envs: int, rollout_depth: int, act_dim: int) -> None:
         self._plans = np.zeros((n_envs, rollout_depth, act_dim), dtype=np.float32)
-        self._moments: list[Moment | None] = [None] * n_envs
+        self._episode_clocks: list[EpisodeClock | None] = [None] * n_envs
 
-    def recall(self, envs: Sequence[int], now: Sequence[Moment]) -> np.ndarray:
+    def recall(self, envs: Sequence[int], now: Sequence[EpisodeClock]) -> np.ndarray:
         """Shift the plans by the steps since their decisions.
 
         :param envs: the environments that decide.
@@ -38,7 +38,7 @@ class PlanMemory:
                 recalled[row, : depth - age] = self._plans[env, age:]
         return recalled
 
-    def keep(self, plans: np.ndarray, envs: Sequence[int], now: Sequence[Moment]) -> None:
+    def keep(self, plans: np.ndarray, envs: Sequence[int], now: Sequence[EpisodeClock]) -> None:
         """Remember the plans of a decision.
 
         :param plans: ``[len(envs), rollout_depth, act_dim]``.
@@ -47,17 +47,17 @@ class PlanMemory:
         """
         for plan, env, moment in zip(plans, envs, now, strict=True):
             self._plans[env] = plan
-            self._moments[env] = moment
+            self._episode_clocks[env] = moment
 
-    def _ages(self, envs: Sequence[int], now: Sequence[Moment]) -> list[int]:
+    def _ages(self, envs: Sequence[int], now: Sequence[EpisodeClock]) -> list[int]:
         """Steps since the decisions; -1 where there is no plan for this episode."""
-        thens = [self._moments[env] for env in envs]
+        thens = [self._episode_clocks[env] for env in envs]
         return [
             present[1] - then[1] if then is not None and then[0] == present[0] else -1
             for then, present in zip(thens, now, strict=True)
         ]
 
-    def state(self, now: Sequence[Moment]) -> dict[str, Any]:
+    def state(self, now: Sequence[EpisodeClock]) -> dict[str, Any]:
         """What :meth:`set_state` takes, as plain values that do not depend on how often was reset.
 
         :param now: the present moment of every environment.
@@ -65,14 +65,14 @@ class PlanMemory:
         """
         return {"plans": self._plans.copy(), "ages": self._ages(range(len(now)), now)}
 
-    def set_state(self, state: dict[str, Any], now: Sequence[Moment]) -> None:
+    def set_state(self, state: dict[str, Any], now: Sequence[EpisodeClock]) -> None:
         """Remember what another memory did.
 
         :param state: from :meth:`state`.
         :param now: the present moment of every environment, which are in the states of then.
         """
         self._plans[:] = state["plans"]
-        self._moments = [
+        self._episode_clocks = [
             (resets, steps - age) if age >= 0 else None
             for (resets, steps), age in zip(now, state["ages"], strict=True)
         ]

@@ -1,4 +1,4 @@
-"""The kinds of objects that environments hold, and how each is frozen, thawed and copied."""
+"""The types of objects that environments hold, and how each is frozen, thawed and copied."""
 
 import ctypes
 import enum
@@ -14,27 +14,35 @@ from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec, WrapperSpec
 
 from sb3_mcbs.snapshot import generators
-from sb3_mcbs.snapshot.arrays import ArrayKind, BytearrayKind, counterpart
-from sb3_mcbs.snapshot.classes import ClassKind, LocalClassKind, is_local, is_made_per_instance
-from sb3_mcbs.snapshot.containers import DictKind, SequenceKind
-from sb3_mcbs.snapshot.drawing import DrawnKind, kind_name
+from sb3_mcbs.snapshot.arrays import ArrayHandler, BytearrayHandler, counterpart
+from sb3_mcbs.snapshot.classes import ClassHandler, LocalClassHandler, is_local, is_made_per_instance
+from sb3_mcbs.snapshot.containers import DictHandler, SequenceHandler
+from sb3_mcbs.snapshot.drawing import DrawnHandler, kind_name
 from sb3_mcbs.snapshot.errors import SnapshotMismatchError
-from sb3_mcbs.snapshot.functions import BuiltinMethodKind, CellKind, FunctionKind, MethodKind
-from sb3_mcbs.snapshot.graph import ATOMIC_CLASSES, MISSING, Copier, Freezer, Kind, Thawer, class_name
+from sb3_mcbs.snapshot.functions import BuiltinMethodHandler, CellHandler, FunctionHandler, MethodHandler
+from sb3_mcbs.snapshot.object_graph import (
+    ATOMIC_CLASSES,
+    MISSING,
+    Copier,
+    Freezer,
+    Thawer,
+    TypeHandler,
+    class_name,
+)
 from sb3_mcbs.snapshot.objects import (
-    ObjectKind,
-    ReducedKind,
+    ObjectHandler,
+    ReducedHandler,
     copy_content,
     freeze_content,
     is_global,
     is_ordinary,
     thaw_content,
 )
-from sb3_mcbs.snapshot.pygame_values import PygameKind, SurfaceKind
-from sb3_mcbs.snapshot.randomness import GeneratorKind, SeedsKind, SpaceKind
+from sb3_mcbs.snapshot.pygame_values import PygameHandler, SurfaceHandler
+from sb3_mcbs.snapshot.randomness import GeneratorHandler, SeedsHandler, SpaceHandler
 from sb3_mcbs.snapshot.registry import SnapshotAdapter, call_on_change, find_adapter
-from sb3_mcbs.snapshot.tensors import TensorKind, is_tensor
-from sb3_mcbs.snapshot.weak import PROXIES, ProxyKind, WeakrefKind
+from sb3_mcbs.snapshot.tensors import TensorHandler, is_tensor
+from sb3_mcbs.snapshot.weak import PROXIES, ProxyHandler, WeakrefHandler
 
 #: Classes whose objects hold caches besides what they say themselves that they are made of.
 _SAY_THEMSELVES = ("pandas.", "PIL.")
@@ -67,7 +75,7 @@ _EXACT: dict[type, str] = {
 _CONSTANT_BASES = (types.ModuleType, EnvSpec, WrapperSpec, logging.Logger, logging.LoggerAdapter)
 
 
-class ConstantKind:
+class ConstantHandler:
     """Objects that are not state: whatever is there stays, and a copy refers to the same."""
 
     name = "constant"
@@ -82,7 +90,7 @@ class ConstantKind:
         return obj
 
 
-class WindowKind(ConstantKind):
+class WindowHandler(ConstantHandler):
     """Windows and render contexts: whatever is there stays, and a copy has none."""
 
     name = "window"
@@ -91,7 +99,7 @@ class WindowKind(ConstantKind):
         return None
 
 
-class PartKind(ConstantKind):
+class PartHandler(ConstantHandler):
     """Parts of a simulator that it hands out, as ``data.body("torso")``: its state is theirs."""
 
     name = "part"
@@ -106,7 +114,7 @@ class PartKind(ConstantKind):
         return counterpart(copier, obj)
 
 
-class AdapterKind:
+class AdapterHandler:
     """Objects for which an adapter is registered."""
 
     name = "adapter"
@@ -164,87 +172,88 @@ def plan_adapter(thawer: Thawer, adapter: SnapshotAdapter | None, obj: Any, stat
         thawer.do_first(lambda: adapter.reseed(obj, int(rng.integers(2**63))))
 
 
-#: Kinds by name, as nodes name them.
-KINDS: dict[str, Kind] = {}
-for _kind_class in (
-    ConstantKind, WindowKind, DrawnKind, PygameKind, SurfaceKind, PartKind, ArrayKind, BytearrayKind,
-    TensorKind, SequenceKind, DictKind, GeneratorKind, SeedsKind, SpaceKind, ObjectKind, ReducedKind,
-    ProxyKind, WeakrefKind, AdapterKind, ClassKind, LocalClassKind, FunctionKind, CellKind, MethodKind,
-    BuiltinMethodKind,
+#: By name, as nodes name them.
+HANDLERS: dict[str, TypeHandler] = {}
+for _handler_class in (
+    ConstantHandler, WindowHandler, DrawnHandler, PygameHandler, SurfaceHandler, PartHandler,
+    ArrayHandler, BytearrayHandler, TensorHandler, SequenceHandler, DictHandler, GeneratorHandler,
+    SeedsHandler, SpaceHandler, ObjectHandler, ReducedHandler, ProxyHandler, WeakrefHandler,
+    AdapterHandler, ClassHandler, LocalClassHandler, FunctionHandler, CellHandler, MethodHandler,
+    BuiltinMethodHandler,
 ):  # fmt: skip
-    KINDS[_kind_class.name] = _kind_class()
+    HANDLERS[_handler_class.name] = _handler_class()
 
-_kind_by_class: dict[type, Kind | None] = dict.fromkeys(ATOMIC_CLASSES)
+_handler_by_class: dict[type, TypeHandler | None] = dict.fromkeys(ATOMIC_CLASSES)
 # Classes that are made inside functions come and go, such as those of clones.
-_kind_by_local_class: weakref.WeakKeyDictionary[type, Kind | None] = weakref.WeakKeyDictionary()
-_kind_of_class: weakref.WeakKeyDictionary[type, Kind | None] = weakref.WeakKeyDictionary()
+_handler_by_local_class: weakref.WeakKeyDictionary[type, TypeHandler | None] = weakref.WeakKeyDictionary()
+_handler_of_class: weakref.WeakKeyDictionary[type, TypeHandler | None] = weakref.WeakKeyDictionary()
 _UNDECIDED: Any = object()
 
 
 def _forget() -> None:
-    _kind_of_class.clear()
-    _kind_by_local_class.clear()
-    _kind_by_class.clear()
-    _kind_by_class.update(dict.fromkeys(ATOMIC_CLASSES))
+    _handler_of_class.clear()
+    _handler_by_local_class.clear()
+    _handler_by_class.clear()
+    _handler_by_class.update(dict.fromkeys(ATOMIC_CLASSES))
 
 
 call_on_change(_forget)
 
 
-def kind_of(obj: Any) -> Kind | None:
-    """Return the kind of an object; None if it never changes.
+def handler_of(obj: Any) -> TypeHandler | None:
+    """Return the handler of an object; None if it never changes.
 
     :param obj: any object that an environment holds.
     """
     cls = type(obj)
-    kind = _kind_by_class.get(cls, _UNDECIDED)
-    if kind is not _UNDECIDED:
-        return kind
+    handler = _handler_by_class.get(cls, _UNDECIDED)
+    if handler is not _UNDECIDED:
+        return handler
     if isinstance(obj, type):  # classes differ from each other
-        kind = _kind_of_class.get(obj, _UNDECIDED)
-        if kind is _UNDECIDED:
-            kind = _kind_of_class[obj] = _decide_class(obj)
-        return kind
+        handler = _handler_of_class.get(obj, _UNDECIDED)
+        if handler is _UNDECIDED:
+            handler = _handler_of_class[obj] = _decide_class(obj)
+        return handler
     if "<" not in cls.__qualname__:
-        kind = _kind_by_class[cls] = _decide(obj, cls)
-        return kind
-    kind = _kind_by_local_class.get(cls, _UNDECIDED)
-    if kind is _UNDECIDED:
-        kind = _kind_by_local_class[cls] = _decide(obj, cls)
-    return kind
+        handler = _handler_by_class[cls] = _decide(obj, cls)
+        return handler
+    handler = _handler_by_local_class.get(cls, _UNDECIDED)
+    if handler is _UNDECIDED:
+        handler = _handler_by_local_class[cls] = _decide(obj, cls)
+    return handler
 
 
-def _decide_class(cls: type) -> Kind | None:
-    if is_made_per_instance(cls, kind_of):
-        return KINDS["class"]
-    return KINDS["local class"] if is_local(cls) else None
+def _decide_class(cls: type) -> TypeHandler | None:
+    if is_made_per_instance(cls, handler_of):
+        return HANDLERS["class"]
+    return HANDLERS["local class"] if is_local(cls) else None
 
 
-def _decide(obj: Any, cls: type) -> Kind | None:
+def _decide(obj: Any, cls: type) -> TypeHandler | None:
     if cls in PROXIES:  # isinstance() takes them for what they stand for
-        return KINDS["proxy"]
+        return HANDLERS["proxy"]
     if issubclass(cls, _ATOMIC_BASES) and not issubclass(cls, np.void):
         return None
     if find_adapter(obj) is not None:
-        return KINDS["adapter"]
+        return HANDLERS["adapter"]
     for known, name in _EXACT.items():
         if cls is known:
-            return KINDS[name]
+            return HANDLERS[name]
     if issubclass(cls, _CONSTANT_BASES):
-        return KINDS["constant"]
+        return HANDLERS["constant"]
     # A pointer class is made once, by whoever needs it first; what it points to says whose it is.
     name = class_name(cls._type_ if issubclass(cls, ctypes._Pointer) else cls)
     if name.startswith(_SIMULATOR_PARTS):
-        return KINDS["constant" if name.startswith(_MUJOCO_DRAWING) else "part"]
+        return HANDLERS["constant" if name.startswith(_MUJOCO_DRAWING) else "part"]
     drawing = kind_name(cls, name)
     if drawing is not None:
-        return KINDS[drawing]
+        return HANDLERS[drawing]
     if is_tensor(obj):
-        return KINDS["torch"]
+        return HANDLERS["torch"]
     if generators.is_generator(obj):
-        return KINDS["generator"]
+        return HANDLERS["generator"]
     if issubclass(cls, spaces.Space):
-        return KINDS["space"]
+        return HANDLERS["space"]
     if is_ordinary(cls) and not name.startswith(_SAY_THEMSELVES):
-        return KINDS["object"]
-    return None if is_global(obj) else KINDS["reduced"]
+        return HANDLERS["object"]
+    return None if is_global(obj) else HANDLERS["reduced"]

@@ -1,4 +1,4 @@
-"""The kinds of objects that an agent and its callbacks hold besides those of environments."""
+"""The types of objects that an agent and its callbacks hold besides those of environments."""
 
 from typing import Any
 
@@ -7,21 +7,21 @@ import torch as th
 
 from sb3_mcbs.checkpoints.encoding import CALLED, codec_of
 from sb3_mcbs.snapshot import SnapshotMismatchError, SnapshotUnsupportedError
-from sb3_mcbs.snapshot.arrays import ArrayKind
-from sb3_mcbs.snapshot.graph import Copier, Freezer, Kind, Thawer, class_name
-from sb3_mcbs.snapshot.kinds import KINDS as ENVIRONMENT_KINDS
-from sb3_mcbs.snapshot.kinds import kind_of as environment_kind_of
-from sb3_mcbs.snapshot.objects import ReducedKind
+from sb3_mcbs.snapshot.arrays import ArrayHandler
+from sb3_mcbs.snapshot.handlers import HANDLERS as ENVIRONMENT_HANDLERS
+from sb3_mcbs.snapshot.handlers import handler_of as environment_handler_of
+from sb3_mcbs.snapshot.object_graph import Copier, Freezer, Thawer, TypeHandler, class_name
+from sb3_mcbs.snapshot.objects import ReducedHandler
 
 
 class _NotCopied:
-    """The part of a kind that checkpoints never use."""
+    """The part of a handler that checkpoints never use."""
 
     def copy(self, copier: Copier, obj: Any) -> Any:
         raise NotImplementedError("agents are not copied")
 
 
-class OwnedArrayKind(ArrayKind):
+class OwnedArrayHandler(ArrayHandler):
     """NumPy arrays. Those in a tensor's memory are put back with memory of their own."""
 
     def freeze(self, freezer: Freezer, obj: np.ndarray) -> Any:
@@ -29,7 +29,7 @@ class OwnedArrayKind(ArrayKind):
         return ("own" if form == "borrowed" else form, *rest)
 
 
-class CalledKind(ReducedKind):
+class CalledHandler(ReducedHandler):
     """Compiled containers that are made by calling their class. No checkpoint asks for another call."""
 
     def freeze(self, freezer: Freezer, obj: Any) -> Any:
@@ -38,7 +38,7 @@ class CalledKind(ReducedKind):
         return super().freeze(freezer, obj)
 
 
-class TensorKind(_NotCopied):
+class TensorHandler(_NotCopied):
     """Tensors: put back in place where there is one of the same shape."""
 
     name = "tensor"
@@ -65,7 +65,7 @@ def _copy_into(tensor: th.Tensor, saved: th.Tensor) -> None:
         tensor.copy_(saved)
 
 
-class OptimizerKind(_NotCopied):
+class OptimizerHandler(_NotCopied):
     """Optimisers: what their ``state_dict`` says."""
 
     name = "optimizer"
@@ -78,7 +78,7 @@ class OptimizerKind(_NotCopied):
         return current
 
 
-class NamedTupleKind(_NotCopied):
+class NamedTupleHandler(_NotCopied):
     """Named tuples."""
 
     name = "namedtuple"
@@ -91,7 +91,7 @@ class NamedTupleKind(_NotCopied):
         return tuple.__new__(cls, [thawer.thaw(item) for item in items])
 
 
-class NetworkKind(_NotCopied):
+class NetworkHandler(_NotCopied):
     """Networks: those of the policy are components of the run, and never frozen themselves."""
 
     name = "network"
@@ -103,7 +103,7 @@ class NetworkKind(_NotCopied):
         raise SnapshotMismatchError("the checkpoint holds a network outside of the policy")
 
 
-class RegisteredKind(_NotCopied):
+class RegisteredHandler(_NotCopied):
     """Objects whose class registered a pair of functions."""
 
     name = "registered"
@@ -116,23 +116,23 @@ class RegisteredKind(_NotCopied):
         return payload[0]
 
 
-_OWN: dict[str, Kind] = {
-    kind.name: kind
-    for kind in (
-        OwnedArrayKind(),
-        CalledKind(),
-        TensorKind(),
-        OptimizerKind(),
-        NamedTupleKind(),
-        NetworkKind(),
-        RegisteredKind(),
+_OWN: dict[str, TypeHandler] = {
+    handler.name: handler
+    for handler in (
+        OwnedArrayHandler(),
+        CalledHandler(),
+        TensorHandler(),
+        OptimizerHandler(),
+        NamedTupleHandler(),
+        NetworkHandler(),
+        RegisteredHandler(),
     )
 }
-KINDS: dict[str, Kind] = {**ENVIRONMENT_KINDS, **_OWN}
+HANDLERS: dict[str, TypeHandler] = {**ENVIRONMENT_HANDLERS, **_OWN}
 
 
-def kind_of(obj: Any) -> Kind | None:
-    """Return the kind of an object; None if it never changes.
+def handler_of(obj: Any) -> TypeHandler | None:
+    """Return the handler of an object; None if it never changes.
 
     :param obj: any object that an agent, a callback or a logger holds.
     """
@@ -144,12 +144,12 @@ def kind_of(obj: Any) -> Kind | None:
     if isinstance(obj, th.optim.Optimizer):
         return _OWN["optimizer"]
     if isinstance(obj, th.distributions.Distribution):
-        return KINDS["constant"]  # made anew from the networks whenever it is needed
+        return HANDLERS["constant"]  # made anew from the networks whenever it is needed
     if codec_of(cls) is not None:
         return _OWN["registered"]
     if issubclass(cls, tuple) and hasattr(cls, "_fields"):
         return _OWN["namedtuple"]
     if isinstance(obj, th.nn.Module):
         return _OWN["network"]
-    kind = environment_kind_of(obj)
-    return _OWN["reduced"] if kind is ENVIRONMENT_KINDS["reduced"] else kind
+    handler = environment_handler_of(obj)
+    return _OWN["reduced"] if handler is ENVIRONMENT_HANDLERS["reduced"] else handler
