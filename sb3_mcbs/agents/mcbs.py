@@ -131,8 +131,7 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         if self._schedule is None:
             self._schedule = SearchSchedule(schedule, self.seed)
         self._schedule.settings = schedule
-        if self.recent_actions is None and settings.proposal_dims is not None:
-            self.recent_actions = RecentActions(get_action_dim(self.action_space))
+        self._remember_actions(settings)
         self._simulated_batches = SimulatedBatches(self)
         set_up_learned_model(self)
         if self.env is not None:
@@ -153,16 +152,19 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
             self._make_searcher(self.env, settings)
             assert self._searcher is not None
             self._searcher.go_on_after(before)
+        self._remember_actions(settings)
+        assert self._schedule is not None
+        self._schedule.settings = schedule
+        if self.env is not None:
+            self._explore_where_not_searched()
+
+    def _remember_actions(self, settings: SearchSettings) -> None:
         if self.recent_actions is None and settings.proposal_dims is not None:
             self.recent_actions = (
                 RecentActions(get_action_dim(self.action_space))
                 if self._searcher is None
                 else self._searcher.recent_actions
             )
-        assert self._schedule is not None
-        self._schedule.settings = schedule
-        if self.env is not None:
-            self._explore_where_not_searched()
 
     def _make_searcher(self, env: VecEnv, settings: SearchSettings) -> None:
         before, self._decision = self._searcher, None

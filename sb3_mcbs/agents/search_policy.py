@@ -12,7 +12,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.preprocessing import maybe_transpose
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-from sb3_mcbs.agents.hyperparameters import SETTING_NAMES, refuse_removed, settings_of_preset
+from sb3_mcbs.agents.hyperparameters import REMOVED, SETTING_NAMES, refuse_removed, settings_of_preset
 from sb3_mcbs.agents.learned_search import make_searcher
 from sb3_mcbs.agents.mcbs import MCBS
 from sb3_mcbs.search import SearchResult, SearchSettings, with_preset
@@ -91,7 +91,6 @@ class SearchPolicy:
         before.close()
 
     def __setattr__(self, name: str, value: Any) -> None:
-        refuse_removed([name])
         attributes = vars(self)
         if "searcher" not in attributes or (name in attributes and name not in _HELD):
             super().__setattr__(name, value)
@@ -108,6 +107,8 @@ class SearchPolicy:
             if changes == {"rollout_depth": 0} and self.settings.forward_model == "ensemble":
                 changes["forward_model"] = "auto"  # where nothing simulates, no model does
             self.settings = replace(self.settings, **changes)
+        elif name in REMOVED:
+            refuse_removed([name])
         elif hasattr(self.model, name):
             setattr(self.model, name, value)
         elif name in SETTING_NAMES:

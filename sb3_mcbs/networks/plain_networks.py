@@ -48,6 +48,17 @@ _CALLED = [
 _TANH = nn.Tanh()
 
 
+def check_unreplaced(called: list[tuple[Any, str, Any]]) -> None:
+    """Refuse to do by other means what somebody has put something else in the place of.
+
+    :param called: classes or modules, names in them, and what the names stood for at first.
+    :raises TypeError: names the first that was replaced.
+    """
+    for owner, name, function in called:
+        if getattr(owner, name) is not function:
+            raise TypeError(f"{owner.__name__}.{name} was replaced")
+
+
 def _check_everywhere() -> None:
     """Refuse what is done to every call of every network."""
     if (
@@ -57,9 +68,7 @@ def _check_everywhere() -> None:
         or torch_module._global_backward_pre_hooks
     ):
         raise TypeError("there are hooks for all modules")
-    for cls, name, method in _CALLED:
-        if getattr(cls, name) is not method:
-            raise TypeError(f"{cls.__name__}.{name} was replaced")
+    check_unreplaced(_CALLED)
     if th.is_autocast_enabled("cpu") or th.is_autocast_enabled("cuda"):
         raise TypeError("autocast is on")
 

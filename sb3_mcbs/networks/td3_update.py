@@ -20,7 +20,13 @@ from stable_baselines3.td3 import td3 as td3_module
 from torch.nn import functional as F
 
 from sb3_mcbs.networks.mlp import MLP
-from sb3_mcbs.networks.plain_networks import actor_mlp, check_trained, critic_mlps, parameters_of
+from sb3_mcbs.networks.plain_networks import (
+    actor_mlp,
+    check_trained,
+    check_unreplaced,
+    critic_mlps,
+    parameters_of,
+)
 
 logger = logging.getLogger("sb3_mcbs")
 
@@ -172,8 +178,7 @@ class FastUpdate(TD3):
         self._present_update()  # whoever cannot have it is told at once
 
     def _make_update(self) -> TD3Update:
-        if any(getattr(owner, name) is not function for owner, name, function in _CALLED):
-            raise TypeError("a function that TD3's train calls was replaced")
+        check_unreplaced(_CALLED)
         if getattr(super().train, "__func__", None) is not _SB3S_TRAIN:
             raise TypeError("a class of the agent's has a train of its own")
         return TD3Update(self)
