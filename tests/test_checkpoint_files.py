@@ -374,13 +374,13 @@ def test_a_registered_pair_of_functions():
 
 def test_ordered_dictionaries_are_the_only_calls():
     from sb3_mcbs.checkpoints.handlers import handler_of
-    from sb3_mcbs.snapshot.object_graph import Freezer
+    from sb3_mcbs.snapshot.object_graph import Capture
 
-    freezer = Freezer(handler_of, {}, 0)
-    freezer.freeze(OrderedDict(a=1))
-    Encoder().encode_nodes(tuple(freezer.nodes))
+    capture = Capture(handler_of, {}, 0)
+    capture(OrderedDict(a=1))
+    Encoder().encode_nodes(tuple(capture.nodes))
     with pytest.raises(SnapshotUnsupportedError, match="range_iterator cannot be written as data"):
-        freezer.freeze(range(3).__iter__())
+        capture(range(3).__iter__())
     # What an environment holds was captured without that check.
     with pytest.raises(CheckpointError, match="made by calling"):
         Encoder().encode_nodes((("reduced", (iter, (), None, (), ())),))

@@ -1,7 +1,7 @@
-"""Frozen state as data: JSON and plain arrays, and back, without ever importing or unpickling.
+"""Captured state as data: JSON and plain arrays, and back, without ever importing or unpickling.
 
-A frozen value (:mod:`sb3_mcbs.snapshot.object_graph`) consists of plain values, arrays, and names of classes
-and functions. Names are all that is written of those: they are resolved among the classes and functions that
+A captured value (:mod:`sb3_mcbs.snapshot.object_graph`) consists of plain values, arrays, and names of
+classes and functions. Only their names are written. They are resolved among the classes and functions that
 the reader hands in, because its own agent and environments use them.
 """
 
@@ -31,7 +31,7 @@ _PLAIN_DTYPES = "biufc"
 
 
 class Encoded(NamedTuple):
-    """A frozen value as data.
+    """A captured value as data.
 
     :param json: what ``json.dumps`` takes.
     :param arrays: the content of all arrays, joined, by the name of their dtype.
@@ -94,7 +94,7 @@ def of_section(section: str, arrays: Mapping[str, np.ndarray]) -> dict[str, np.n
 
 
 class Encoder:
-    """Turns frozen values into data.
+    """Turns captured values into data.
 
     :ivar names: the classes and functions that were met, by the names that stand for them.
     """
@@ -112,7 +112,7 @@ class Encoder:
     def encode(self, value: Any) -> Any:
         """Encode a value.
 
-        :param value: a frozen value.
+        :param value: a captured value.
         :raises CheckpointError: if part of it is neither plain nor registered.
         """
         cls = type(value)
@@ -151,7 +151,7 @@ class Encoder:
         return {"name": self._name(value)}
 
     def encode_nodes(self, nodes: tuple[tuple[str, Any], ...]) -> Any:
-        """Encode the nodes that frozen values refer to.
+        """Encode the nodes that captured values refer to.
 
         :param nodes: kind and payload of each.
         :raises CheckpointError: if one can only be made by calling something.
@@ -184,7 +184,7 @@ class Encoder:
 
 
 class Decoder:
-    """Turns data back into frozen values.
+    """Turns data back into captured values.
 
     :param arrays: of :class:`Encoded`.
     :param names: the classes and functions that may be meant, by name.

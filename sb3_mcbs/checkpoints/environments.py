@@ -14,7 +14,7 @@ from sb3_mcbs.checkpoints.errors import CheckpointError
 from sb3_mcbs.checkpoints.files import read_written, results_file, write_again
 from sb3_mcbs.checkpoints.names import known_names
 from sb3_mcbs.snapshot import Snapshot, SnapshotEnvWrapper, SnapshotError
-from sb3_mcbs.snapshot.pairing import FrozenLayer
+from sb3_mcbs.snapshot.pairing import CapturedLayer
 from sb3_mcbs.snapshot.replay import Episode
 
 _Generators = dict[str, Any]
@@ -86,7 +86,7 @@ def restore_environment(
     decoder = Decoder(encoded.arrays, names)
     nodes = decoder.decode_nodes(encoded.json["nodes"])
     content = decoder.decode(encoded.json["content"])
-    layers = tuple(FrozenLayer(*layer) for layer in content["layers"])
+    layers = tuple(CapturedLayer(*layer) for layer in content["layers"])
     try:
         wrapper.restore(Snapshot(layers, nodes, content["spaces"], content["last_observation"]))
     except SnapshotError as error:

@@ -10,7 +10,7 @@ from sb3_mcbs.snapshot import SnapshotMismatchError, SnapshotUnsupportedError
 from sb3_mcbs.snapshot.arrays import ArrayHandler
 from sb3_mcbs.snapshot.handlers import HANDLERS as ENVIRONMENT_HANDLERS
 from sb3_mcbs.snapshot.handlers import handler_of as environment_handler_of
-from sb3_mcbs.snapshot.object_graph import Copier, Freezer, Thawer, TypeHandler, class_name
+from sb3_mcbs.snapshot.object_graph import Capture, Copier, Restore, TypeHandler, class_name
 from sb3_mcbs.snapshot.objects import ReducedHandler
 
 
@@ -24,18 +24,18 @@ class _NotCopied:
 class OwnedArrayHandler(ArrayHandler):
     """NumPy arrays. Those in a tensor's memory are put back with memory of their own."""
 
-    def freeze(self, freezer: Freezer, obj: np.ndarray) -> Any:
-        form, *rest = super().freeze(freezer, obj)
+    def capture(self, capture: Capture, obj: np.ndarray) -> Any:
+        form, *rest = super().capture(capture, obj)
         return ("own" if form == "borrowed" else form, *rest)
 
 
 class CalledHandler(ReducedHandler):
     """Compiled containers that are made by calling their class. No checkpoint asks for another call."""
 
-    def freeze(self, freezer: Freezer, obj: Any) -> Any:
+    def capture(self, capture: Capture, obj: Any) -> Any:
         if not isinstance(obj, CALLED):
             raise SnapshotUnsupportedError(f"a {class_name(type(obj))} cannot be written as data")
-        return super().freeze(freezer, obj)
+        return super().capture(capture, obj)
 
 
 class TensorHandler(_NotCopied):
@@ -43,19 +43,19 @@ class TensorHandler(_NotCopied):
 
     name = "tensor"
 
-    def freeze(self, freezer: Freezer, obj: th.Tensor) -> Any:
+    def capture(self, capture: Capture, obj: th.Tensor) -> Any:
         try:
             content = obj.detach().cpu().numpy().copy()
         except TypeError as error:
             raise SnapshotUnsupportedError(f"it is a tensor that NumPy cannot hold: {error}") from error
         return content, str(obj.device), obj.requires_grad and obj.is_leaf
 
-    def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
+    def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
         content, device, requires_grad = payload
         saved = th.from_numpy(np.ascontiguousarray(content).reshape(content.shape))
         same = isinstance(current, th.Tensor) and current.is_leaf and current.shape == saved.shape
-        if same and current.dtype == saved.dtype and thawer.claim(current):
-            thawer.do_then(_copy_into, current, saved)
+        if same and current.dtype == saved.dtype and restore.claim(current):
+            restore.do_then(_copy_into, current, saved)
             return current
         return saved.to(device).requires_grad_(requires_grad)
 
@@ -70,11 +70,11 @@ class OptimizerHandler(_NotCopied):
 
     name = "optimizer"
 
-    def freeze(self, freezer: Freezer, obj: th.optim.Optimizer) -> Any:
-        return freezer.freeze(obj.state_dict())
+    def capture(self, capture: Capture, obj: th.optim.Optimizer) -> Any:
+        return capture(obj.state_dict())
 
-    def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
-        thawer.do_then(current.load_state_dict, thawer.thaw(payload))
+    def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
+        restore.do_then(current.load_state_dict, restore(payload))
         return current
 
 
@@ -83,23 +83,23 @@ class NamedTupleHandler(_NotCopied):
 
     name = "namedtuple"
 
-    def freeze(self, freezer: Freezer, obj: Any) -> Any:
-        return type(obj), tuple(freezer.freeze(item) for item in obj)
+    def capture(self, capture: Capture, obj: Any) -> Any:
+        return type(obj), tuple(capture(item) for item in obj)
 
-    def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
+    def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
         cls, items = payload
-        return tuple.__new__(cls, [thawer.thaw(item) for item in items])
+        return tuple.__new__(cls, [restore(item) for item in items])
 
 
 class NetworkHandler(_NotCopied):
-    """Networks: those of the policy are components of the run, and never frozen themselves."""
+    """Networks: those of the policy are components of the run, and never captured themselves."""
 
     name = "network"
 
-    def freeze(self, freezer: Freezer, obj: th.nn.Module) -> Any:
+    def capture(self, capture: Capture, obj: th.nn.Module) -> Any:
         raise SnapshotUnsupportedError(f"it is a network ({class_name(type(obj))}) outside of the policy")
 
-    def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
+    def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
         raise SnapshotMismatchError("the checkpoint holds a network outside of the policy")
 
 
@@ -108,11 +108,11 @@ class RegisteredHandler(_NotCopied):
 
     name = "registered"
 
-    def freeze(self, freezer: Freezer, obj: Any) -> Any:
+    def capture(self, capture: Capture, obj: Any) -> Any:
         # The encoder asks the class, and so does the decoder.
         return (obj,)
 
-    def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
+    def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
         return payload[0]
 
 

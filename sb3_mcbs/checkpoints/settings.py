@@ -30,7 +30,7 @@ from sb3_mcbs.checkpoints.errors import CheckpointError
 from sb3_mcbs.checkpoints.files import results_file
 from sb3_mcbs.checkpoints.handlers import HANDLERS, handler_of
 from sb3_mcbs.snapshot import SnapshotUnsupportedError
-from sb3_mcbs.snapshot.object_graph import Freezer, Thawer
+from sb3_mcbs.snapshot.object_graph import Capture, Restore
 
 #: Parameters of constructors that are kept under another name.
 _ATTRIBUTES = {"policy": "policy_class", "stats_window_size": "_stats_window_size"}
@@ -48,7 +48,7 @@ def describe_agent(agent: OffPolicyAlgorithm) -> Encoded:
     :return: the class's name and its constructor's arguments.
     :raises CheckpointError: if one cannot be written as data; names it.
     """
-    encoder, freezer = Encoder(), Freezer(handler_of, {}, 0)
+    encoder, capture = Encoder(), Capture(handler_of, {}, 0)
     settings = {}
     for parameter in inspect.signature(type(agent).__init__).parameters.values():
         if parameter.name in _NOT_SETTINGS or parameter.kind is parameter.VAR_KEYWORD:
@@ -65,12 +65,12 @@ def describe_agent(agent: OffPolicyAlgorithm) -> Encoded:
         if isinstance(value, np.generic):
             value = value.item()  # as which SB3 keeps what it is given
         try:
-            settings[parameter.name] = freezer.freeze(value)
+            settings[parameter.name] = capture(value)
         except SnapshotUnsupportedError as error:
             raise CheckpointError(
                 f"{parameter.name} cannot be part of a checkpoint: {error.reason}."
             ) from error
-    for kind, payload in freezer.nodes:
+    for kind, payload in capture.nodes:
         if kind == "function" and (payload[1] or "<" in payload[0].qualname):
             raise CheckpointError(
                 f"The settings hold the function {payload[0].qualname}, which cannot be written as data. For "
@@ -79,7 +79,7 @@ def describe_agent(agent: OffPolicyAlgorithm) -> Encoded:
     data = {
         "class": name_of(type(agent)),
         "settings": {name: encoder.encode(value) for name, value in settings.items()},
-        "nodes": encoder.encode_nodes(tuple(freezer.nodes)),
+        "nodes": encoder.encode_nodes(tuple(capture.nodes)),
     }
     return Encoded(data, encoder.arrays)
 
@@ -95,9 +95,9 @@ def make_agent(encoded: Encoded, names: dict[str, Any], env: GymEnv) -> OffPolic
     cls = decoder.decode({"name": encoded.json["class"]})
     if not (isinstance(cls, type) and issubclass(cls, OffPolicyAlgorithm)):
         raise CheckpointError(f"The checkpoint names {cls!r} as the class of its agent.")
-    thawer = Thawer(decoder.decode_nodes(encoded.json["nodes"]), HANDLERS, [], "restore")
-    settings = {name: thawer.thaw(decoder.decode(value)) for name, value in encoded.json["settings"].items()}
-    thawer.commit()
+    restore = Restore(decoder.decode_nodes(encoded.json["nodes"]), HANDLERS, [], "restore")
+    settings = {name: restore(decoder.decode(value)) for name, value in encoded.json["settings"].items()}
+    restore.commit()
     return cls(env=env, **settings)
 
 

@@ -28,8 +28,8 @@ from sb3_mcbs.checkpoints.handlers import HANDLERS, handler_of
 from sb3_mcbs.checkpoints.names import known_names
 from sb3_mcbs.models import Environments, WorkerEnvironments
 from sb3_mcbs.snapshot import SnapshotEnvWrapper, SnapshotError, SnapshotUnsupportedError
-from sb3_mcbs.snapshot.attributes import freeze_attributes, thaw_attributes
-from sb3_mcbs.snapshot.object_graph import Freezer, Ref, Thawer, class_name
+from sb3_mcbs.snapshot.attributes import capture_attributes, restore_attributes
+from sb3_mcbs.snapshot.object_graph import Capture, Ref, Restore, class_name
 
 RUN = "run"
 _POLICY = "policy"
@@ -133,15 +133,15 @@ class RunState:
 
     def _encode(self) -> tuple[Encoder, Encoded]:
         parts = self._components
-        freezer = Freezer(handler_of, {id(part): Ref(i) for i, part in enumerate(parts.values())}, len(parts))
+        capture = Capture(handler_of, {id(part): Ref(i) for i, part in enumerate(parts.values())}, len(parts))
         encoder = Encoder()
         attributes: dict[str, Any] = {}
         nodes: list[Any] = []
         for name, part in parts.items():
             try:
-                frozen = freeze_attributes(freezer, part, not_state_of(part), skip_unsupported=False)
-                attributes[name] = encoder.encode(frozen)
-                nodes += encoder.encode_nodes(tuple(freezer.nodes[len(nodes) :]))
+                captured = capture_attributes(capture, part, not_state_of(part), skip_unsupported=False)
+                attributes[name] = encoder.encode(captured)
+                nodes += encoder.encode_nodes(tuple(capture.nodes[len(nodes) :]))
             except (SnapshotUnsupportedError, CheckpointError) as error:
                 raise CheckpointError(_refusal(name, part, error)) from error
         rest = {
@@ -161,7 +161,7 @@ class RunState:
         parts = self._components
         names = {**known_names(classes), **self._encode()[0].names}
         decoder = Decoder(encoded.arrays, names)
-        thawer = Thawer(
+        restore = Restore(
             decoder.decode_nodes(encoded.json["nodes"]), HANDLERS, list(parts.values()), "restore"
         )
         if encoded.json["attributes"].keys() != parts.keys():
@@ -171,13 +171,13 @@ class RunState:
                 saved = decoder.decode(encoded.json["attributes"][name])
                 not_state = not_state_of(part, saved)
                 attributes = {key: value for key, value in saved.items() if key not in not_state}
-                thaw_attributes(thawer, part, not_state, attributes, delete_others=True)
+                restore_attributes(restore, part, not_state, attributes, delete_others=True)
         except SnapshotError as error:
             raise CheckpointError(
                 f"The checkpoint is of a run that was set up differently: {error}"
             ) from error
         rest = decoder.decode(encoded.json["rest"])
-        thawer.commit()
+        restore.commit()
         return rest
 
     def _set_rest(self, rest: dict[str, Any]) -> None:

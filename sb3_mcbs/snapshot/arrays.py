@@ -7,7 +7,7 @@ from typing import Any, Literal
 import numpy as np
 
 from sb3_mcbs.snapshot.errors import SnapshotMismatchError, SnapshotUnsupportedError
-from sb3_mcbs.snapshot.object_graph import Copier, Freezer, Thawer
+from sb3_mcbs.snapshot.object_graph import Capture, Copier, Restore
 from sb3_mcbs.snapshot.tensors import bytes_of, is_tensor
 
 
@@ -16,48 +16,48 @@ class ArrayHandler:
 
     name = "array"
 
-    def freeze(self, freezer: Freezer, obj: np.ndarray) -> Any:
+    def capture(self, capture: Capture, obj: np.ndarray) -> Any:
         base, layout = (None, None) if obj.base is None else _base_and_layout(obj)
         if layout is not None:
-            return "view", freezer.freeze(base), layout
+            return "view", capture(base), layout
         if obj.dtype.hasobject:
-            items = [freezer.freeze(item) for item in obj.ravel().tolist()]
+            items = [capture(item) for item in obj.ravel().tolist()]
             return "objects", obj.shape, obj.dtype, _order(obj), items
         content = obj.copy(order="K")
         content.setflags(write=False)
         if obj.base is not None and _is_borrowed(obj):
             if type(_owner(obj)).__module__.startswith("pygame."):
                 raise SnapshotUnsupportedError("it shows the memory of a pygame surface")
-            return "borrowed", content, freezer.places.find(obj)
+            return "borrowed", content, capture.places.find(obj)
         owner = None if obj.base is None else _owner(obj)
-        if _is_of_cython(owner) and freezer.owner_of(owner, obj) is not None:
+        if _is_of_cython(owner) and capture.owner_of(owner, obj) is not None:
             raise SnapshotUnsupportedError("it shares its memory with another array, and both are Cython's")
         return "own", content, obj.flags.writeable
 
-    def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
+    def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
         form = payload[0]
         if form == "own":
-            if thawer.is_original(index, current) and _is_alike(current, *payload[1:]):
-                thawer.do_then(_write, current, payload[1])
+            if restore.is_original(index, current) and _is_alike(current, *payload[1:]):
+                restore.do_then(_write, current, payload[1])
                 return current
             return _with_flag(payload[1].copy(order="K"), payload[2])
         if form == "view":
-            base, layout = thawer.thaw(payload[1]), payload[2]
-            stays = thawer.is_original(index, current) and _lies_in(current, base, layout)
+            base, layout = restore(payload[1]), payload[2]
+            stays = restore.is_original(index, current) and _lies_in(current, base, layout)
             return current if stays else _view_of(base, layout)
         if form == "objects":
             _, shape, dtype, order, items = payload
             made = np.empty(shape, dtype, order)
-            stays = thawer.is_original(index, current) and current.shape == shape
-            thawer.memo[index] = current if stays else made
+            stays = restore.is_original(index, current) and current.shape == shape
+            restore.memo[index] = current if stays else made
             for place, item in zip(np.ndindex(shape), items, strict=True):
-                made[place] = thawer.thaw(item)
+                made[place] = restore(item)
             if stays:
-                thawer.do_then(_write, current, made)
-            return thawer.memo[index]
+                restore.do_then(_write, current, made)
+            return restore.memo[index]
         content, place = payload[1:]
-        stays = thawer.is_original(index, current)
-        view = current if stays else thawer.places.view_at(place, current)
+        stays = restore.is_original(index, current)
+        view = current if stays else restore.places.view_at(place, current)
         if view is not current:
             return view
         if not isinstance(current, np.ndarray) or current.shape != content.shape or not _is_borrowed(current):
@@ -65,7 +65,7 @@ class ArrayHandler:
                 f"The snapshot holds a view of shape {content.shape} into memory that is not an array's, "
                 "and this environment has none at its place."
             )
-        thawer.do_then(_write, current, content)
+        restore.do_then(_write, current, content)
         return current
 
     def copy(self, copier: Copier, obj: np.ndarray) -> Any:
@@ -101,12 +101,12 @@ class BytearrayHandler:
 
     name = "bytearray"
 
-    def freeze(self, freezer: Freezer, obj: bytearray) -> Any:
+    def capture(self, capture: Capture, obj: bytearray) -> Any:
         return bytes(obj)
 
-    def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
-        if thawer.is_original(index, current) and len(current) == len(payload):
-            thawer.do_then(current.__setitem__, slice(None), payload)
+    def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
+        if restore.is_original(index, current) and len(current) == len(payload):
+            restore.do_then(current.__setitem__, slice(None), payload)
             return current
         return bytearray(payload)
 

@@ -7,21 +7,21 @@ import gymnasium as gym
 from sb3_mcbs.snapshot.drawing import stays
 from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
 from sb3_mcbs.snapshot.handlers import handler_of
-from sb3_mcbs.snapshot.object_graph import ATOMIC_CLASSES, MISSING, Freezer, Ref, Thawer
+from sb3_mcbs.snapshot.object_graph import ATOMIC_CLASSES, MISSING, Capture, Ref, Restore
 from sb3_mcbs.snapshot.objects import attributes_of, set_attributes
-from sb3_mcbs.snapshot.randomness import thaw_np_random
+from sb3_mcbs.snapshot.randomness import restore_np_random
 
 
-def freeze_attributes(
-    freezer: Freezer, env: Any, not_state: frozenset[str], skip_unsupported: bool
+def capture_attributes(
+    capture: Capture, env: Any, not_state: frozenset[str], skip_unsupported: bool
 ) -> dict[str, Any]:
     """Capture the attributes of a layer.
 
-    :param freezer: what captures them.
+    :param capture: what captures them.
     :param env: the wrapper or environment.
     :param not_state: names of attributes to leave out.
     :param skip_unsupported: leave out what cannot be captured instead of raising an error.
-    :return: the frozen value of each.
+    :return: the captured value of each.
     :raises SnapshotUnsupportedError: names the attribute.
     """
     attributes = {}
@@ -31,17 +31,17 @@ def freeze_attributes(
         if type(value) in ATOMIC_CLASSES:
             attributes[name] = value
         elif skip_unsupported:
-            frozen = freezer.freeze_or_none(value)
-            if frozen is not None:
-                attributes[name] = frozen[0]
+            captured = capture.attempt(value)
+            if captured is not None:
+                attributes[name] = captured[0]
         else:
-            attributes[name] = _freeze(freezer, env, name, value)
+            attributes[name] = _capture(capture, env, name, value)
     return attributes
 
 
-def _freeze(freezer: Freezer, env: Any, name: str, value: Any) -> Any:
+def _capture(capture: Capture, env: Any, name: str, value: Any) -> Any:
     try:
-        return freezer.freeze(value)
+        return capture(value)
     except SnapshotUnsupportedError as error:
         error.path.insert(0, f"{type(env).__name__}.{name}")
         raise
@@ -51,12 +51,12 @@ def _freeze(freezer: Freezer, env: Any, name: str, value: Any) -> Any:
         raise too_deep from error
 
 
-def thaw_attributes(
-    thawer: Thawer, env: Any, not_state: frozenset[str], attributes: dict[str, Any], delete_others: bool
+def restore_attributes(
+    restore: Restore, env: Any, not_state: frozenset[str], attributes: dict[str, Any], delete_others: bool
 ) -> None:
     """Plan to put back the attributes of a layer.
 
-    :param thawer: keeps the plan.
+    :param restore: keeps the plan.
     :param env: the wrapper or environment.
     :param not_state: names of attributes that are left alone.
     :param attributes: captured attributes.
@@ -71,7 +71,7 @@ def thaw_attributes(
                 del values[name]
         elif type(value) is Ref and name != "_np_random":
             try:
-                values[name] = thawer.thaw(value, have.get(name, MISSING))
+                values[name] = restore(value, have.get(name, MISSING))
             except SnapshotUnsupportedError as error:
                 error.path.insert(0, f"{type(env).__name__}.{name}")
                 raise
@@ -80,13 +80,13 @@ def thaw_attributes(
     # Gymnasium keeps it on the class until it is first needed.
     values.pop("_np_random", None)
     if not isinstance(env, gym.Wrapper):
-        thaw_np_random(thawer, attributes.get("_np_random"), vars(env))
+        restore_np_random(restore, attributes.get("_np_random"), vars(env))
     gone = set()
     if delete_others:
         for name in have.keys() - attributes.keys():
             if name not in not_state and not _stays(name, have[name]):
                 gone.add(name)
-    thawer.do_then(set_attributes, env, values, gone)
+    restore.do_then(set_attributes, env, values, gone)
 
 
 def _stays(name: str, value: Any) -> bool:

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from typing import Any
 from weakref import WeakSet, finalize
 
-from sb3_mcbs.snapshot.attributes import freeze_attributes
+from sb3_mcbs.snapshot.attributes import capture_attributes
 from sb3_mcbs.snapshot.bullet_handles import Handle, is_client
 from sb3_mcbs.snapshot.bullet_recorder import (
     BulletRecorder,
@@ -35,7 +35,7 @@ from sb3_mcbs.snapshot.bullet_world import (
 from sb3_mcbs.snapshot.errors import SnapshotError, SnapshotMismatchError, SnapshotUnsupportedError
 from sb3_mcbs.snapshot.handlers import handler_of
 from sb3_mcbs.snapshot.layers import NOT_STATE, RECORDER
-from sb3_mcbs.snapshot.object_graph import Freezer, Ref
+from sb3_mcbs.snapshot.object_graph import Capture, Ref
 from sb3_mcbs.snapshot.registry import SnapshotAdapter
 from sb3_mcbs.snapshot.replay import ReplayAdapter, constructor_arguments
 
@@ -241,8 +241,8 @@ def is_server(obj: Any) -> bool:
 
 
 def _refuse_uncapturable(env: Any, not_state: frozenset[str]) -> None:
-    freezer = Freezer(handler_of, {id(env): Ref(0)}, 1)
-    freeze_attributes(freezer, env, NOT_STATE | not_state, skip_unsupported=False)
+    capture = Capture(handler_of, {id(env): Ref(0)}, 1)
+    capture_attributes(capture, env, NOT_STATE | not_state, skip_unsupported=False)
 
 
 def _difference(servers: tuple[Handle, ...], worlds: list[World]) -> str | None:

@@ -11,7 +11,7 @@ from typing import Any
 
 from sb3_mcbs.snapshot.errors import SnapshotMismatchError, SnapshotUnsupportedError
 from sb3_mcbs.snapshot.functions import fingerprint
-from sb3_mcbs.snapshot.object_graph import MISSING, Copier, Freezer, Thawer, class_name
+from sb3_mcbs.snapshot.object_graph import MISSING, Capture, Copier, Restore, class_name
 
 #: Members that Python makes itself, and those that only say what a class is.
 _NOT_STATE = frozenset(
@@ -193,10 +193,10 @@ class LocalClassHandler:
 
     name = "local class"
 
-    def freeze(self, freezer: Freezer, obj: type) -> Any:
+    def capture(self, capture: Capture, obj: type) -> Any:
         return ClassName(obj)
 
-    def thaw(self, thawer: Thawer, index: int, payload: ClassName, current: Any) -> Any:
+    def restore(self, restore: Restore, index: int, payload: ClassName, current: Any) -> Any:
         return current if payload.is_name_of(current) else payload.find()
 
     def copy(self, copier: Copier, obj: type) -> Any:
@@ -208,34 +208,34 @@ class ClassHandler:
 
     name = "class"
 
-    def freeze(self, freezer: Freezer, obj: type) -> Any:
+    def capture(self, capture: Capture, obj: type) -> Any:
         members = []
         for name, member in _members(obj):
             try:
-                members.append((name, tuple(freezer.freeze(part) for part in _parts(member))))
+                members.append((name, tuple(capture(part) for part in _parts(member))))
             except SnapshotUnsupportedError as error:
                 error.path.insert(0, f" ({name} of the class {obj.__qualname__})")
                 raise
-        return ClassName(obj), tuple(freezer.freeze(base) for base in obj.__bases__), tuple(members)
+        return ClassName(obj), tuple(capture(base) for base in obj.__bases__), tuple(members)
 
-    def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
+    def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
         name, bases, members = payload
-        if name.is_name_of(current) and id(current) not in thawer.foreign:
-            thawer.memo[index] = current
+        if name.is_name_of(current) and id(current) not in restore.foreign:
+            restore.memo[index] = current
             for base, its in zip(bases, current.__bases__, strict=True):
-                thawer.thaw(base, its)
+                restore(base, its)
             for key, parts in members:
                 member = vars(current).get(key)
-                thawed = _put_together(member, _thaw_parts(thawer, parts, _parts(member)))
-                if thawed is not member:
-                    thawer.do_then(type.__setattr__, current, key, thawed)
+                restored = _put_together(member, _restore_parts(restore, parts, _parts(member)))
+                if restored is not member:
+                    restore.do_then(type.__setattr__, current, key, restored)
             return current
         template = name.find()
         # What the class at hand closes over may be another instance's.
-        made = thawer.memo[index] = _blank(template, tuple(thawer.thaw(base) for base in bases))
+        made = restore.memo[index] = _blank(template, tuple(restore(base) for base in bases))
         for key, parts in members:
             member = vars(template)[key]
-            type.__setattr__(made, key, _put_together(member, _thaw_parts(thawer, parts, (MISSING,) * 3)))
+            type.__setattr__(made, key, _put_together(member, _restore_parts(restore, parts, (MISSING,) * 3)))
         return made
 
     def copy(self, copier: Copier, obj: type) -> Any:
@@ -246,8 +246,8 @@ class ClassHandler:
         return made
 
 
-def _thaw_parts(thawer: Thawer, parts: tuple[Any, ...], have: tuple[Any, ...]) -> tuple[Any, ...]:
-    return tuple(thawer.thaw(part, its) for part, its in zip(parts, have, strict=False))
+def _restore_parts(restore: Restore, parts: tuple[Any, ...], have: tuple[Any, ...]) -> tuple[Any, ...]:
+    return tuple(restore(part, its) for part, its in zip(parts, have, strict=False))
 
 
 def _blank(cls: type, bases: tuple[type, ...]) -> Any:

@@ -5,7 +5,7 @@ from collections import deque
 from typing import Any
 
 from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
-from sb3_mcbs.snapshot.object_graph import ATOMIC_CLASSES, MISSING, Copier, Freezer, Ref, Thawer
+from sb3_mcbs.snapshot.object_graph import ATOMIC_CLASSES, MISSING, Capture, Copier, Ref, Restore
 
 
 class SequenceHandler:
@@ -13,30 +13,30 @@ class SequenceHandler:
 
     name = "sequence"
 
-    def freeze(self, freezer: Freezer, obj: Any) -> Any:
-        return type(obj), getattr(obj, "maxlen", None), freeze_items(freezer, obj)
+    def capture(self, capture: Capture, obj: Any) -> Any:
+        return type(obj), getattr(obj, "maxlen", None), capture_items(capture, obj)
 
-    def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
+    def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
         cls, maxlen, items = payload
         have = current if type(current) in (list, tuple, deque) else ()
         n_have = len(have)
-        thawed = (
-            thawer.thaw(item, have[place] if place < n_have else MISSING) if type(item) is Ref else item
+        restored = (
+            restore(item, have[place] if place < n_have else MISSING) if type(item) is Ref else item
             for place, item in enumerate(items)
         )
         if cls is tuple or cls is frozenset:
-            parts = list(thawed)
-            stays = thawer.is_original(index, current) and all(map(operator.is_, current, parts))
+            parts = list(restored)
+            stays = restore.is_original(index, current) and all(map(operator.is_, current, parts))
             return current if stays else cls(parts)
-        if thawer.is_original(index, current):
-            thawer.memo[index] = current
-            thawer.do_then(_refill, current, list(thawed))
+        if restore.is_original(index, current):
+            restore.memo[index] = current
+            restore.do_then(_refill, current, list(restored))
             return current
         made: Any = deque(maxlen=maxlen) if cls is deque else cls()
-        thawer.memo[index] = made
+        restore.memo[index] = made
         if cls is set:
-            return _kept_or_filled(thawer, index, made, list(thawed), current)
-        made.extend(thawed)
+            return _kept_or_filled(restore, index, made, list(restored), current)
+        made.extend(restored)
         return made
 
     def copy(self, copier: Copier, obj: Any) -> Any:
@@ -69,7 +69,7 @@ def refill_dict(current: dict[Any, Any], items: dict[Any, Any]) -> None:
 _EQUAL_IS_SAME = frozenset({type(None), bool, int, str, bytes})
 
 
-def _kept_or_filled(thawer: Thawer, index: int, made: set[Any], items: list[Any], current: Any) -> set[Any]:
+def _kept_or_filled(restore: Restore, index: int, made: set[Any], items: list[Any], current: Any) -> set[Any]:
     """Fill a set, or keep the one that is there if only that lists the items in the captured order.
 
     The order depends on what a set held before, which nobody can read.
@@ -77,8 +77,8 @@ def _kept_or_filled(thawer: Thawer, index: int, made: set[Any], items: list[Any]
     made.update(items)
     if type(current) is not set or len(current) != len(made) or all(map(operator.is_, made, items)):
         return made
-    if all(map(_is_same, current, items)) and thawer.claim(current):
-        made = thawer.memo[index] = current
+    if all(map(_is_same, current, items)) and restore.claim(current):
+        made = restore.memo[index] = current
     return made
 
 
@@ -90,22 +90,22 @@ def _is_same(one: Any, other: Any) -> bool:
     return type(one) in _EQUAL_IS_SAME and bool(one == other)
 
 
-def freeze_items(freezer: Freezer, items: Any) -> tuple[Any, ...]:
-    """Freeze the items of a container.
+def capture_items(capture: Capture, items: Any) -> tuple[Any, ...]:
+    """Capture the items of a container.
 
-    :param freezer: what freezes them.
+    :param capture: what captures them.
     :param items: a container with a length.
     """
     if ATOMIC_CLASSES.issuperset(map(type, items)):
         return tuple(items)
-    frozen = []
+    captured = []
     for place, item in enumerate(items):
         try:
-            frozen.append(freezer.freeze(item))
+            captured.append(capture(item))
         except SnapshotUnsupportedError as error:
             error.path.insert(0, f"[{place}]")
             raise
-    return tuple(frozen)
+    return tuple(captured)
 
 
 class DictHandler:
@@ -113,28 +113,28 @@ class DictHandler:
 
     name = "dict"
 
-    def freeze(self, freezer: Freezer, obj: dict[Any, Any]) -> Any:
-        frozen = []
+    def capture(self, capture: Capture, obj: dict[Any, Any]) -> Any:
+        captured = []
         for key, value in obj.items():
             try:
-                frozen.append((freezer.freeze(key), freezer.freeze(value)))
+                captured.append((capture(key), capture(value)))
             except SnapshotUnsupportedError as error:
                 error.path.insert(0, f"[{key!r}]")
                 raise
-        return tuple(frozen)
+        return tuple(captured)
 
-    def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
+    def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
         made: dict[Any, Any] = {}
-        stays = thawer.is_original(index, current)
-        thawer.memo[index] = current if stays else made
+        stays = restore.is_original(index, current)
+        restore.memo[index] = current if stays else made
         have = current if type(current) is dict else {}
         for key, value in payload:
-            thawed_key = thawer.thaw(key)
-            thawed = thawer.thaw(value, have.get(thawed_key, MISSING))
-            if thawed is not MISSING:
-                made[thawed_key] = thawed
+            restored_key = restore(key)
+            restored = restore(value, have.get(restored_key, MISSING))
+            if restored is not MISSING:
+                made[restored_key] = restored
         if stays:
-            thawer.do_then(refill_dict, current, made)
+            restore.do_then(refill_dict, current, made)
             return current
         return made
 

@@ -7,7 +7,7 @@ import types
 from typing import Any
 
 from sb3_mcbs.snapshot.errors import SnapshotMismatchError, SnapshotUnsupportedError
-from sb3_mcbs.snapshot.object_graph import ATOMIC_CLASSES, MISSING, Copier, Freezer, Thawer
+from sb3_mcbs.snapshot.object_graph import ATOMIC_CLASSES, MISSING, Capture, Copier, Restore
 from sb3_mcbs.snapshot.stand_ins import bound, function_of
 
 _EMPTY = ("empty",)
@@ -90,37 +90,37 @@ class FunctionHandler:
 
     name = "function"
 
-    def freeze(self, freezer: Freezer, obj: types.FunctionType) -> Any:
+    def capture(self, capture: Capture, obj: types.FunctionType) -> Any:
         if not is_own(obj):
-            return FunctionName(obj), freezer.freeze_or_none(*(obj.__closure__ or ())) or (), None
+            return FunctionName(obj), capture.attempt(*(obj.__closure__ or ())) or (), None
         cells = []
         for name, cell in zip(obj.__code__.co_freevars, obj.__closure__ or (), strict=True):
             try:
-                cells.append(freezer.freeze(cell))
+                cells.append(capture(cell))
             except SnapshotUnsupportedError as error:
                 error.path.insert(0, f" (variable {name} of {obj.__qualname__})")
                 raise
-        return FunctionName(obj), tuple(cells), _freeze_extras(freezer, obj)
+        return FunctionName(obj), tuple(cells), _capture_extras(capture, obj)
 
-    def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
+    def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
         name, cells, extras = payload
-        if name.is_name_of(current) and id(current) not in thawer.foreign:
-            thawer.memo[index] = current
+        if name.is_name_of(current) and id(current) not in restore.foreign:
+            restore.memo[index] = current
             if cells:
                 for value, cell in zip(cells, current.__closure__ or (), strict=True):
-                    thawer.thaw(value, cell)
-            _thaw_extras(thawer, extras, current, live=True)
+                    restore(value, cell)
+            _restore_extras(restore, extras, current, live=True)
             return current
         function = name.find()
         if not cells and extras in (None, _NO_EXTRAS):
             return function
         # The function that was found closes over another instance's variables, which are not to be touched.
-        missing = [ref for ref in cells if ref.index not in thawer.memo]
-        thawer.memo.update((ref.index, types.CellType()) for ref in missing)
-        made = thawer.memo[index] = _with_cells(function, tuple(thawer.memo[ref.index] for ref in cells))
+        missing = [ref for ref in cells if ref.index not in restore.memo]
+        restore.memo.update((ref.index, types.CellType()) for ref in missing)
+        made = restore.memo[index] = _with_cells(function, tuple(restore.memo[ref.index] for ref in cells))
         for ref in missing:
-            _thaw_content(thawer, thawer.memo[ref.index], thawer.nodes[ref.index][1])
-        _thaw_extras(thawer, extras, made, live=False)
+            _restore_content(restore, restore.memo[ref.index], restore.nodes[ref.index][1])
+        _restore_extras(restore, extras, made, live=False)
         return made
 
     def copy(self, copier: Copier, obj: types.FunctionType) -> Any:
@@ -160,35 +160,37 @@ def _extras(function: types.FunctionType) -> Extras:
     )
 
 
-def _freeze_extras(freezer: Freezer, function: types.FunctionType) -> Extras:
+def _capture_extras(capture: Capture, function: types.FunctionType) -> Extras:
     defaults, keywords, attributes = _extras(function)
     try:
         return (
-            freezer.freeze(defaults),
-            freezer.freeze(keywords),
-            tuple((name, freezer.freeze(value)) for name, value in attributes),
+            capture(defaults),
+            capture(keywords),
+            tuple((name, capture(value)) for name, value in attributes),
         )
     except SnapshotUnsupportedError as error:
         error.path.insert(0, f" (default or attribute of {function.__qualname__})")
         raise
 
 
-def _thaw_extras(thawer: Thawer, extras: Extras | None, function: types.FunctionType, live: bool) -> None:
+def _restore_extras(
+    restore: Restore, extras: Extras | None, function: types.FunctionType, live: bool
+) -> None:
     """Plan to give a function its defaults and attributes; only a live one's own may be used again."""
     if extras is None:
         return
     for name, value in zip(("__defaults__", "__kwdefaults__"), extras, strict=False):
         if value is not None:
             there = getattr(function, name) if live else None
-            thawer.do_then(setattr, function, name, thawer.thaw(value, MISSING if there is None else there))
+            restore.do_then(setattr, function, name, restore(value, MISSING if there is None else there))
     have = vars(function) if live else {}
     for name, value in extras[2]:
-        thawed = thawer.thaw(value, have.get(name, MISSING))
-        if thawed is not MISSING:
-            thawer.do_then(setattr, function, name, thawed)
+        restored = restore(value, have.get(name, MISSING))
+        if restored is not MISSING:
+            restore.do_then(setattr, function, name, restored)
     kept = {_WRAPPED, *(name for name, _ in extras[2])}
     for name in vars(function).keys() - kept:
-        thawer.do_then(delattr, function, name)
+        restore.do_then(delattr, function, name)
 
 
 def _copy(copier: Copier, function: types.FunctionType, extras: Extras) -> types.FunctionType:
@@ -231,16 +233,16 @@ class CellHandler:
 
     name = "cell"
 
-    def freeze(self, freezer: Freezer, obj: types.CellType) -> Any:
+    def capture(self, capture: Capture, obj: types.CellType) -> Any:
         try:
             content = obj.cell_contents
         except ValueError:
             return _EMPTY
-        return ("full", freezer.freeze(content))
+        return ("full", capture(content))
 
-    def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
-        cell = thawer.memo[index] = types.CellType() if current is MISSING else current
-        _thaw_content(thawer, cell, payload)
+    def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
+        cell = restore.memo[index] = types.CellType() if current is MISSING else current
+        _restore_content(restore, cell, payload)
         return cell
 
     def copy(self, copier: Copier, obj: types.CellType) -> Any:
@@ -249,13 +251,13 @@ class CellHandler:
         return made
 
 
-def _thaw_content(thawer: Thawer, cell: types.CellType, payload: Any) -> None:
+def _restore_content(restore: Restore, cell: types.CellType, payload: Any) -> None:
     if payload == _EMPTY:
         return
     have = _content(cell)
-    value = thawer.thaw(payload[1], have)
+    value = restore(payload[1], have)
     if value is not have and value is not MISSING:
-        thawer.do_then(setattr, cell, "cell_contents", value)
+        restore.do_then(setattr, cell, "cell_contents", value)
 
 
 def _copy_content(copier: Copier, cell: types.CellType, made: types.CellType) -> None:
@@ -276,13 +278,13 @@ class MethodHandler:
 
     name = "method"
 
-    def freeze(self, freezer: Freezer, obj: types.MethodType) -> Any:
-        return freezer.freeze(function_of(obj)), freezer.freeze(obj.__self__)
+    def capture(self, capture: Capture, obj: types.MethodType) -> Any:
+        return capture(function_of(obj)), capture(obj.__self__)
 
-    def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
+    def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
         is_method = isinstance(current, types.MethodType)
-        function = thawer.thaw(payload[0], current.__func__ if is_method else MISSING)
-        made = bound(function, thawer.thaw(payload[1], current.__self__ if is_method else MISSING))
+        function = restore(payload[0], current.__func__ if is_method else MISSING)
+        made = bound(function, restore(payload[1], current.__self__ if is_method else MISSING))
         return current if made == current else made
 
     def copy(self, copier: Copier, obj: types.MethodType) -> Any:
@@ -294,17 +296,17 @@ class BuiltinMethodHandler:
 
     name = "builtin"
 
-    def freeze(self, freezer: Freezer, obj: types.BuiltinMethodType) -> Any:
+    def capture(self, capture: Capture, obj: types.BuiltinMethodType) -> Any:
         owner = obj.__self__
         if owner is None or isinstance(owner, types.ModuleType):
             return obj, None
-        return obj.__name__, freezer.freeze(owner)
+        return obj.__name__, capture(owner)
 
-    def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
+    def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
         name, owner = payload
         if owner is None:
             return name
-        return getattr(thawer.thaw(owner, getattr(current, "__self__", MISSING)), name)
+        return getattr(restore(owner, getattr(current, "__self__", MISSING)), name)
 
     def copy(self, copier: Copier, obj: types.BuiltinMethodType) -> Any:
         owner = obj.__self__

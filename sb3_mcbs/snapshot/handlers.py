@@ -1,4 +1,4 @@
-"""The types of objects that environments hold, and how each is frozen, thawed and copied."""
+"""The types of objects that environments hold, and how each is captured, restored and copied."""
 
 import ctypes
 import enum
@@ -23,20 +23,20 @@ from sb3_mcbs.snapshot.functions import BuiltinMethodHandler, CellHandler, Funct
 from sb3_mcbs.snapshot.object_graph import (
     ATOMIC_CLASSES,
     MISSING,
+    Capture,
     Copier,
-    Freezer,
-    Thawer,
+    Restore,
     TypeHandler,
     class_name,
 )
 from sb3_mcbs.snapshot.objects import (
     ObjectHandler,
     ReducedHandler,
+    capture_content,
     copy_content,
-    freeze_content,
     is_global,
     is_ordinary,
-    thaw_content,
+    restore_content,
 )
 from sb3_mcbs.snapshot.pygame_values import PygameHandler, SurfaceHandler
 from sb3_mcbs.snapshot.randomness import GeneratorHandler, SeedsHandler, SpaceHandler
@@ -80,10 +80,10 @@ class ConstantHandler:
 
     name = "constant"
 
-    def freeze(self, freezer: Freezer, obj: Any) -> Any:
+    def capture(self, capture: Capture, obj: Any) -> Any:
         return None
 
-    def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
+    def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
         return current
 
     def copy(self, copier: Copier, obj: Any) -> Any:
@@ -104,11 +104,11 @@ class PartHandler(ConstantHandler):
 
     name = "part"
 
-    def freeze(self, freezer: Freezer, obj: Any) -> Any:
-        return freezer.places.find(obj)
+    def capture(self, capture: Capture, obj: Any) -> Any:
+        return capture.places.find(obj)
 
-    def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
-        return current if thawer.is_original(index, current) else thawer.places.view_at(payload, current)
+    def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
+        return current if restore.is_original(index, current) else restore.places.view_at(payload, current)
 
     def copy(self, copier: Copier, obj: Any) -> Any:
         return counterpart(copier, obj)
@@ -119,15 +119,15 @@ class AdapterHandler:
 
     name = "adapter"
 
-    def freeze(self, freezer: Freezer, obj: Any) -> Any:
+    def capture(self, capture: Capture, obj: Any) -> Any:
         adapter = find_adapter(obj)
         assert adapter is not None
-        freezer.adapted.append(obj)
+        capture.adapted.append(obj)
         state = adapter.capture(obj)
-        content = freeze_content(freezer, obj, adapter.not_state) if adapter.with_attributes else None
+        content = capture_content(capture, obj, adapter.not_state) if adapter.with_attributes else None
         return class_name(type(obj)), state, content
 
-    def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
+    def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
         cls, state, content = payload
         if current is MISSING or class_name(type(current)) != cls:
             here = "nothing" if current is MISSING else f"a {class_name(type(current))}"
@@ -135,11 +135,11 @@ class AdapterHandler:
                 f"The snapshot holds the state of a {cls}, and this environment has {here} there."
             )
         adapter = find_adapter(current)
-        thawer.adapted[index] = current
-        plan_adapter(thawer, adapter, current, state)
+        restore.adapted[index] = current
+        plan_adapter(restore, adapter, current, state)
         if content is not None and adapter is not None:
-            thawer.memo[index] = current
-            thaw_content(thawer, content, current, adapter.not_state)
+            restore.memo[index] = current
+            restore_content(restore, content, current, adapter.not_state)
         return current
 
     def copy(self, copier: Copier, obj: Any) -> Any:
@@ -152,10 +152,10 @@ class AdapterHandler:
         return made
 
 
-def plan_adapter(thawer: Thawer, adapter: SnapshotAdapter | None, obj: Any, state: Any) -> None:
+def plan_adapter(restore: Restore, adapter: SnapshotAdapter | None, obj: Any, state: Any) -> None:
     """Check a state that an adapter captured and plan to put it back.
 
-    :param thawer: keeps the plan.
+    :param restore: keeps the plan.
     :param adapter: the adapter for ``obj``.
     :param obj: the object to restore.
     :param state: what the adapter captured.
@@ -166,10 +166,10 @@ def plan_adapter(thawer: Thawer, adapter: SnapshotAdapter | None, obj: Any, stat
             f"The snapshot needs an adapter for {class_name(type(obj))}, and none is registered here."
         )
     adapter.validate(obj, state)
-    thawer.do_first(adapter.restore, obj, state)
-    if isinstance(thawer.rng, np.random.Generator):
-        rng = thawer.rng
-        thawer.do_first(lambda: adapter.reseed(obj, int(rng.integers(2**63))))
+    restore.do_first(adapter.restore, obj, state)
+    if isinstance(restore.rng, np.random.Generator):
+        rng = restore.rng
+        restore.do_first(lambda: adapter.reseed(obj, int(rng.integers(2**63))))
 
 
 #: By name, as nodes name them.

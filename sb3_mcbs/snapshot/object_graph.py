@@ -1,4 +1,4 @@
-"""Ordinary state as a graph: frozen into plain values, put back, copied.
+"""Ordinary state as a graph: captured into plain values, put back, copied.
 
 An environment's attributes form a graph: wrappers refer to each other, arrays are shared, functions
 close over objects. The three classes here walk it, each with a memo, so that what was shared stays
@@ -40,7 +40,7 @@ def class_name(cls: type) -> str:
 
 
 class Ref:
-    """A frozen value that stands for the node with this number."""
+    """A captured value that stands for the node with this number."""
 
     __slots__ = ("index",)
 
@@ -56,11 +56,11 @@ class TypeHandler(Protocol):
 
     name: str
 
-    def freeze(self, freezer: "Freezer", obj: Any) -> Any:
+    def capture(self, capture: "Capture", obj: Any) -> Any:
         """Return the object's content as plain values and references to nodes."""
 
-    def thaw(self, thawer: "Thawer", index: int, payload: Any, current: Any) -> Any:
-        """Return the object for a frozen content; ``current`` is what is at its place now."""
+    def restore(self, restore: "Restore", index: int, payload: Any, current: Any) -> Any:
+        """Return the object for a captured content; ``current`` is what is at its place now."""
 
     def copy(self, copier: "Copier", obj: Any) -> Any:
         """Return an independent copy and enter it in the copier's memo."""
@@ -69,8 +69,8 @@ class TypeHandler(Protocol):
 Node = tuple[str, Any]
 
 
-class Freezer:
-    """Turns values into frozen values and nodes.
+class Capture:
+    """Turns values into captured values and nodes.
 
     :param handler_of: the handler of an object; None for objects that never change and stand for themselves.
     :param known: id of an object -> the node it is, for objects that are named rather than captured.
@@ -101,8 +101,8 @@ class Freezer:
         # An id is only unique among objects that live, and some parts of objects are temporary.
         self._alive: list[Any] = []
 
-    def freeze(self, value: Any) -> Any:
-        """Return a frozen value.
+    def __call__(self, value: Any) -> Any:
+        """Return a captured value.
 
         :param value: any value that an environment holds.
         :raises SnapshotUnsupportedError: if part of it cannot be captured.
@@ -116,7 +116,7 @@ class Freezer:
         self.nodes.append(("pending", None))
         self.objects.append(value)
         try:
-            self.nodes[ref.index] = (handler.name, handler.freeze(self, value))
+            self.nodes[ref.index] = (handler.name, handler.capture(self, value))
         except (SnapshotError, RecursionError):
             raise
         except Exception as error:
@@ -129,7 +129,7 @@ class Freezer:
         """Return the node that a part was captured with; None if an object is the first to have it.
 
         :param part: what several objects may consist of, such as the bit generator of a generator.
-        :param obj: the object that is being frozen; from now on, the part's owner if it has none.
+        :param obj: the object that is being captured; from now on, the part's owner if it has none.
         """
         owner = self._owners.get(id(part))
         if owner is None:
@@ -137,14 +137,14 @@ class Freezer:
             self._alive.append(part)
         return owner
 
-    def freeze_or_none(self, *values: Any) -> tuple[Any, ...] | None:
-        """Return frozen values, or None where :meth:`freeze` would raise for one of them.
+    def attempt(self, *values: Any) -> tuple[Any, ...] | None:
+        """Return captured values, or None where :meth:`__call__` would raise for one of them.
 
         :param values: any values that an environment holds.
         """
         n_nodes, n_adapted, n_tensors = len(self.nodes), len(self.adapted), len(self.tensors)
         try:
-            return tuple([self.freeze(value) for value in values])
+            return tuple([self(value) for value in values])
         except (SnapshotUnsupportedError, RecursionError):
             for obj in self.objects[n_nodes:]:
                 self._memo.pop(id(obj), None)
@@ -156,10 +156,10 @@ class Freezer:
             return None
 
 
-class Thawer:
-    """Turns frozen values back into objects, without changing anything until :meth:`commit`.
+class Restore:
+    """Turns captured values back into objects, without changing anything until :meth:`commit`.
 
-    :param nodes: the nodes that the frozen values refer to.
+    :param nodes: the nodes that the captured values refer to.
     :param handlers: by name.
     :param known: the objects that stand for the first nodes, in order.
     :param rng: what happens to random generators: "restore", "keep", or a generator to seed them from.
@@ -193,10 +193,10 @@ class Thawer:
         self._first: list[tuple[Any, ...]] = []
         self._then: list[tuple[Any, ...]] = []
 
-    def thaw(self, value: Any, current: Any = MISSING) -> Any:
-        """Return the object for a frozen value.
+    def __call__(self, value: Any, current: Any = MISSING) -> Any:
+        """Return the object for a captured value.
 
-        :param value: a frozen value.
+        :param value: a captured value.
         :param current: what is at its place now, if anything.
         :raises SnapshotMismatchError: if the snapshot cannot have come from here.
         """
@@ -209,12 +209,12 @@ class Thawer:
         if self._originals is not None:
             current = self._originals[index]
         try:
-            thawed = self.memo[index] = self._handlers[name].thaw(self, index, payload, current)
+            restored = self.memo[index] = self._handlers[name].restore(self, index, payload, current)
         except SnapshotError:
             raise
         except Exception as error:
             raise _cannot_be_made(name if current is MISSING else class_name(type(current)), error) from error
-        return thawed
+        return restored
 
     def is_original(self, index: int, current: Any) -> bool:
         """Return whether an object is the one that a node was made of, and is to stay the one that it is.

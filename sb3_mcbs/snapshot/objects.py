@@ -11,9 +11,9 @@ from collections import Counter, OrderedDict, defaultdict
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
-from sb3_mcbs.snapshot.containers import freeze_items, refill_dict
+from sb3_mcbs.snapshot.containers import capture_items, refill_dict
 from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
-from sb3_mcbs.snapshot.object_graph import MISSING, Copier, Freezer, Ref, Thawer, class_name
+from sb3_mcbs.snapshot.object_graph import MISSING, Capture, Copier, Ref, Restore, class_name
 
 
 class ObjectHandler:
@@ -21,18 +21,18 @@ class ObjectHandler:
 
     name = "object"
 
-    def freeze(self, freezer: Freezer, obj: Any) -> Any:
-        return freezer.freeze(type(obj)), freeze_content(freezer, obj)
+    def capture(self, capture: Capture, obj: Any) -> Any:
+        return capture(type(obj)), capture_content(capture, obj)
 
-    def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
+    def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
         cls, attributes = payload
-        cls = thawer.thaw(cls, MISSING if current is MISSING else type(current))
-        made_anew = _is_value(cls) and not thawer.is_original(index, current)
-        if made_anew or type(current) is not cls or not thawer.claim(current):
+        cls = restore(cls, MISSING if current is MISSING else type(current))
+        made_anew = _is_value(cls) and not restore.is_original(index, current)
+        if made_anew or type(current) is not cls or not restore.claim(current):
             have = attributes_of(current) if type(current) is cls else {}
-            return _made_anew(thawer, index, cls, attributes, have)
-        thawer.memo[index] = current
-        thaw_content(thawer, attributes, current)
+            return _made_anew(restore, index, cls, attributes, have)
+        restore.memo[index] = current
+        restore_content(restore, attributes, current)
         return current
 
     def copy(self, copier: Copier, obj: Any) -> Any:
@@ -44,44 +44,44 @@ class ObjectHandler:
 Attributes = tuple[tuple[str, Any], ...]
 
 
-def freeze_content(freezer: Freezer, obj: Any, leave_out: frozenset[str] = frozenset()) -> Attributes:
-    """Freeze the attributes of an object.
+def capture_content(capture: Capture, obj: Any, leave_out: frozenset[str] = frozenset()) -> Attributes:
+    """Capture the attributes of an object.
 
-    :param freezer: what freezes them.
+    :param capture: what captures them.
     :param obj: the object.
     :param leave_out: names of attributes that are not state.
-    :return: names and frozen values.
+    :return: names and captured values.
     """
     attributes = []
     for name, value in attributes_of(obj).items():
         if name in leave_out:
             continue
         try:
-            attributes.append((name, freezer.freeze(value)))
+            attributes.append((name, capture(value)))
         except SnapshotUnsupportedError as error:
             error.path.insert(0, f".{name}")
             raise
     return tuple(attributes)
 
 
-def thaw_content(
-    thawer: Thawer, attributes: Attributes, obj: Any, leave_out: frozenset[str] = frozenset()
+def restore_content(
+    restore: Restore, attributes: Attributes, obj: Any, leave_out: frozenset[str] = frozenset()
 ) -> None:
     """Plan to put back the attributes of an object that is there.
 
-    :param thawer: keeps the plan.
-    :param attributes: names and frozen values.
+    :param restore: keeps the plan.
+    :param attributes: names and captured values.
     :param obj: the object.
     :param leave_out: names of attributes that stay as they are.
     """
     have = attributes_of(obj)
     values = {}
     for name, value in attributes:
-        thawed = thawer.thaw(value, have.get(name, MISSING))
-        if thawed is not MISSING:
-            values[name] = thawed
+        restored = restore(value, have.get(name, MISSING))
+        if restored is not MISSING:
+            values[name] = restored
     gone = set(have).difference(leave_out, [name for name, _ in attributes])
-    thawer.do_then(_set_changed if thawer.in_place else set_attributes, obj, values, gone)
+    restore.do_then(_set_changed if restore.in_place else set_attributes, obj, values, gone)
 
 
 def _set_changed(obj: Any, values: dict[str, Any], gone: Iterable[str]) -> None:
@@ -131,25 +131,25 @@ def _is_value(cls: type) -> bool:
     return cls.__hash__ is not None and cls.__hash__ is not object.__hash__
 
 
-def _made_anew(thawer: Thawer, index: int, cls: type, attributes: Any, have: dict[str, Any]) -> Any:
+def _made_anew(restore: Restore, index: int, cls: type, attributes: Any, have: dict[str, Any]) -> Any:
     """Make an object and set its attributes at once.
 
     Those that a hash is computed from come first: on the way to the others may be a set that it is in.
     """
     made: Any = blank(cls)
-    thawer.memo[index] = made
+    restore.memo[index] = made
     put = _setter(made)
     values = {}
-    for name, value in sorted(attributes, key=lambda item: not _is_hashed(thawer, item[1])):
-        thawed = thawer.thaw(value, have.get(name, MISSING))
-        if thawed is not MISSING:
-            values[name] = thawed
-            put(name, thawed)
+    for name, value in sorted(attributes, key=lambda item: not _is_hashed(restore, item[1])):
+        restored = restore(value, have.get(name, MISSING))
+        if restored is not MISSING:
+            values[name] = restored
+            put(name, restored)
     _set_in_order(made, {name: values[name] for name, _ in attributes if name in values})
     return made
 
 
-def _is_hashed(walker: Thawer | Copier, value: Any) -> bool:
+def _is_hashed(walker: Restore | Copier, value: Any) -> bool:
     """Return whether an attribute holds what hashes are computed from: a constant, or a tuple of some."""
     if isinstance(walker, Copier):
         return type(value) in (tuple, frozenset) or walker.handler_of(value) is None
@@ -221,44 +221,44 @@ class ReducedHandler:
 
     name = "reduced"
 
-    def freeze(self, freezer: Freezer, obj: Any) -> Any:
+    def capture(self, capture: Capture, obj: Any) -> Any:
         function, arguments, state, items, pairs = _reduce(obj)
         return (
-            freezer.freeze(function),
-            freezer.freeze(arguments),
-            freezer.freeze(state),
-            freeze_items(freezer, items),
-            tuple((freezer.freeze(key), freezer.freeze(value)) for key, value in pairs),
+            capture(function),
+            capture(arguments),
+            capture(state),
+            capture_items(capture, items),
+            tuple((capture(key), capture(value)) for key, value in pairs),
             class_name(type(obj)),
         )
 
-    def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
-        in_place = thawer.in_place
+    def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
+        in_place = restore.in_place
         # Others may read at once what they are made of, before that is as it was.
-        thawer.in_place = in_place and isinstance(current, _ONLY_REFER)
-        made = self._make(thawer, index, payload, current)
-        thawer.in_place = in_place
-        if thawer.is_original(index, current) and type(current) in _DICTIONARIES:
-            thawer.do_then(refill_dict, current, made)
+        restore.in_place = in_place and isinstance(current, _ONLY_REFER)
+        made = self._make(restore, index, payload, current)
+        restore.in_place = in_place
+        if restore.is_original(index, current) and type(current) in _DICTIONARIES:
+            restore.do_then(refill_dict, current, made)
             return current
         return made
 
-    def _make(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
+    def _make(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
         function, arguments, state, items, pairs, cls = payload
         # What is at its place says what is at the places inside.
         have = _reduced_or_nothing(current) if class_name(type(current)) == cls else _NOTHING_THERE
-        make = thawer.thaw(function, have.function)
-        made = thawer.memo[index] = make(*thawer.thaw(arguments, have.arguments))
+        make = restore(function, have.function)
+        made = restore.memo[index] = make(*restore(arguments, have.arguments))
         content = [
-            thawer.thaw(item, have.items[place] if place < len(have.items) else MISSING)
+            restore(item, have.items[place] if place < len(have.items) else MISSING)
             for place, item in enumerate(items)
         ]
         pairs_there = dict(have.pairs)
         filled = []
         for key, value in pairs:
-            thawed_key = thawer.thaw(key)
-            filled.append((thawed_key, thawer.thaw(value, pairs_there.get(thawed_key, MISSING))))
-        return _fill(made, thawer.thaw(state, have.state), content, filled)
+            restored_key = restore(key)
+            filled.append((restored_key, restore(value, pairs_there.get(restored_key, MISSING))))
+        return _fill(made, restore(state, have.state), content, filled)
 
     def copy(self, copier: Copier, obj: Any) -> Any:
         function, arguments, state, items, pairs = _reduce(obj)

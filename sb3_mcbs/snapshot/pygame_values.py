@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_mcbs.snapshot.object_graph import MISSING, Copier, Freezer, Thawer, class_name
-from sb3_mcbs.snapshot.objects import copy_content, freeze_content, thaw_content
+from sb3_mcbs.snapshot.object_graph import MISSING, Capture, Copier, Restore, class_name
+from sb3_mcbs.snapshot.objects import capture_content, copy_content, restore_content
 
 _SURFACE = "pygame.surface.Surface"
 
@@ -79,20 +79,20 @@ class PygameHandler:
 
     name = "pygame"
 
-    def freeze(self, freezer: Freezer, obj: Any) -> Any:
-        return freezer.freeze(type(obj)), _class_of(type(obj)).read(obj), freeze_content(freezer, obj)
+    def capture(self, capture: Capture, obj: Any) -> Any:
+        return capture(type(obj)), _class_of(type(obj)).read(obj), capture_content(capture, obj)
 
-    def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
+    def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
         cls, content, attributes = payload
-        cls = thawer.thaw(cls, MISSING if current is MISSING else type(current))
+        cls = restore(cls, MISSING if current is MISSING else type(current))
         its = _class_of(cls)
-        stays = thawer.is_original(index, current)
-        made = thawer.memo[index] = current if stays else _make(cls, *its.arguments(content))
+        stays = restore.is_original(index, current)
+        made = restore.memo[index] = current if stays else _make(cls, *its.arguments(content))
         if stays:
-            thawer.do_then(its.write, made, content)
+            restore.do_then(its.write, made, content)
         else:
             its.write(made, content)
-        thaw_content(thawer, attributes, made)
+        restore_content(restore, attributes, made)
         return made
 
     def copy(self, copier: Copier, obj: Any) -> Any:
@@ -118,27 +118,27 @@ class SurfaceHandler:
 
     name = "surface"
 
-    def freeze(self, freezer: Freezer, obj: Any) -> Any:
+    def capture(self, capture: Capture, obj: Any) -> Any:
         if is_display(obj):
             return None
         parent = obj.get_parent()
         pixels = _pixels(obj) if parent is None else None
-        cls, form = freezer.freeze(type(obj)), _format(obj)
-        return cls, form, pixels, freezer.freeze(parent), freeze_content(freezer, obj)
+        cls, form = capture(type(obj)), _format(obj)
+        return cls, form, pixels, capture(parent), capture_content(capture, obj)
 
-    def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
+    def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
         if payload is None:
             return current
         cls, form, pixels, parent, attributes = payload
-        cls = thawer.thaw(cls, MISSING if current is MISSING else type(current))
+        cls = restore(cls, MISSING if current is MISSING else type(current))
         there = current if type(current) is cls and not is_display(current) else None
-        parent = thawer.thaw(parent, MISSING if there is None else there.get_parent())
-        stays = thawer.is_original(index, current)
-        same = there is not None and _is_same(there, form, pixels, parent) and thawer.claim(there)
-        made = thawer.memo[index] = current if stays or same else _blank_surface(cls, form, parent)
+        parent = restore(parent, MISSING if there is None else there.get_parent())
+        stays = restore.is_original(index, current)
+        same = there is not None and _is_same(there, form, pixels, parent) and restore.claim(there)
+        made = restore.memo[index] = current if stays or same else _blank_surface(cls, form, parent)
         if not same:
-            thawer.do_then(_draw, made, form, pixels)
-        thaw_content(thawer, attributes, made)
+            restore.do_then(_draw, made, form, pixels)
+        restore_content(restore, attributes, made)
         return made
 
     def copy(self, copier: Copier, obj: Any) -> Any:

@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 from gymnasium.envs.registration import load_env_creator
 
-from sb3_mcbs.snapshot.attributes import freeze_attributes, thaw_attributes
+from sb3_mcbs.snapshot.attributes import capture_attributes, restore_attributes
 from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
 from sb3_mcbs.snapshot.handlers import HANDLERS, handler_of
 from sb3_mcbs.snapshot.layers import NOT_STATE, RECORDER
-from sb3_mcbs.snapshot.object_graph import Freezer, Node, Ref, Thawer, private_copy
+from sb3_mcbs.snapshot.object_graph import Capture, Node, Ref, Restore, private_copy
 from sb3_mcbs.snapshot.registry import SnapshotAdapter
 
 
@@ -104,9 +104,9 @@ class Recorder:
 
         :param arguments: of the reset that follows.
         """
-        freezer = Freezer(handler_of, {id(self.env): Ref(0)}, 1)
-        attributes = freeze_attributes(freezer, self.env, self._not_state, skip_unsupported=True)
-        self.episode = Episode(attributes, tuple(freezer.nodes), private_copy(arguments), ())
+        capture = Capture(handler_of, {id(self.env): Ref(0)}, 1)
+        attributes = capture_attributes(capture, self.env, self._not_state, skip_unsupported=True)
+        self.episode = Episode(attributes, tuple(capture.nodes), private_copy(arguments), ())
         self.actions = []
         self.unrecorded = self.must_reset = False
 
@@ -115,9 +115,9 @@ class Recorder:
 
         :param episode: what to repeat.
         """
-        thawer = Thawer(episode.nodes, HANDLERS, [self.env], "restore")
-        thaw_attributes(thawer, self.env, self._not_state, episode.attributes, delete_others=False)
-        thawer.commit()
+        restore = Restore(episode.nodes, HANDLERS, [self.env], "restore")
+        restore_attributes(restore, self.env, self._not_state, episode.attributes, delete_others=False)
+        restore.commit()
         render_mode, self.env.render_mode = self.env.render_mode, None
         try:
             self._begin_episode(private_copy(episode.reset))

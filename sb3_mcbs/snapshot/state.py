@@ -9,15 +9,15 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 
-from sb3_mcbs.snapshot.attributes import freeze_attributes, thaw_attributes
+from sb3_mcbs.snapshot.attributes import capture_attributes, restore_attributes
 from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
 from sb3_mcbs.snapshot.functions import is_own
 from sb3_mcbs.snapshot.global_generators import globals_kept
 from sb3_mcbs.snapshot.handlers import HANDLERS, handler_of, plan_adapter
 from sb3_mcbs.snapshot.layers import OF_ONE_MONITOR, Layer, layers_of
-from sb3_mcbs.snapshot.object_graph import Copier, Freezer, Node, Ref, RngMode, Thawer
+from sb3_mcbs.snapshot.object_graph import Capture, Copier, Node, Ref, Restore, RngMode
 from sb3_mcbs.snapshot.objects import attributes_of, blank, set_attributes
-from sb3_mcbs.snapshot.pairing import FrozenLayer, check, pair
+from sb3_mcbs.snapshot.pairing import CapturedLayer, check, pair
 from sb3_mcbs.snapshot.places import Places
 from sb3_mcbs.snapshot.registry import SnapshotAdapter, find_adapter
 from sb3_mcbs.snapshot.stand_ins import stand_in
@@ -35,7 +35,7 @@ class Kept(NamedTuple):
     :param objects: what each node was made of.
     """
 
-    layers: tuple[FrozenLayer, ...]
+    layers: tuple[CapturedLayer, ...]
     nodes: tuple[Node, ...]
     objects: list[Any]
 
@@ -93,7 +93,7 @@ class Stack:
                 base.render_mode = None
             if any(_is_method_of(left_out, obj) for obj in kept.objects):
                 # Whoever holds such a method gets that of the stand-in.
-                self.thaw(kept.layers, kept.nodes, "restore")
+                self.restore(kept.layers, kept.nodes, "restore")
             yield
         finally:
             for layer, cls in zip(left_out, classes, strict=True):
@@ -113,7 +113,7 @@ class Stack:
         adapted = [layer.env for layer in self.layers if id(layer.env) in self._adapters]
         return [*(self._watched or ()), *adapted]
 
-    def freeze(self, monitor: bool = True) -> tuple[tuple[FrozenLayer, ...], tuple[Node, ...]]:
+    def capture(self, monitor: bool = True) -> tuple[tuple[CapturedLayer, ...], tuple[Node, ...]]:
         """Capture the state.
 
         :param monitor: whether what a ``Monitor`` holds is captured.
@@ -130,14 +130,14 @@ class Stack:
         :raises SnapshotUnsupportedError: if a layer holds something that cannot be captured.
         """
         while True:
-            freezer = Freezer(handler_of, self._refs, len(self.layers), Places(self._watched or ()))
-            frozen = tuple([self._freeze_layer(freezer, layer, monitor) for layer in self.layers])
-            self._watch(freezer.adapted)
-            if freezer.places.are_of(freezer.adapted):
+            capture = Capture(handler_of, self._refs, len(self.layers), Places(self._watched or ()))
+            captured = tuple([self._capture_layer(capture, layer, monitor) for layer in self.layers])
+            self._watch(capture.adapted)
+            if capture.places.are_of(capture.adapted):
                 break
-        check_memory(freezer)
-        check_held(freezer, frozen)
-        return Kept(frozen, tuple(freezer.nodes), freezer.objects)
+        check_memory(capture)
+        check_held(capture, captured)
+        return Kept(captured, tuple(capture.nodes), capture.objects)
 
     def put_back(self, kept: Kept) -> None:
         """Put the layers into a captured state, with the objects that they held then.
@@ -146,7 +146,7 @@ class Stack:
 
         :param kept: of :meth:`keep`.
         """
-        self._thaw(kept.layers, kept.nodes, "restore", kept.objects)
+        self._restore(kept.layers, kept.nodes, "restore", kept.objects)
         self.find_simulators()
 
     def become(self, kept: Kept, shares: bool) -> None:
@@ -157,8 +157,8 @@ class Stack:
         """
         own = [obj for obj in kept.objects if shares and issubclass(type(obj), type | types.FunctionType)]
         foreign = frozenset(id(obj) for obj in own if isinstance(obj, type) or is_own(obj))
-        self.freeze()  # finds the simulators
-        self._thaw(kept.layers, kept.nodes, "restore", None, foreign)
+        self.capture()  # finds the simulators
+        self._restore(kept.layers, kept.nodes, "restore", None, foreign)
 
     def find_simulators(self) -> None:
         """Watch the simulators that are there now: a reset of the environment may exchange its own."""
@@ -168,7 +168,7 @@ class Stack:
         if not all(id(obj) in present for obj in self._watched or ()):
             # Whoever takes a snapshot is told what cannot be captured.
             with contextlib.suppress(SnapshotUnsupportedError):
-                self.freeze()
+                self.capture()
 
     def _watch(self, held: list[Any]) -> None:
         """Watch simulators.
@@ -186,73 +186,75 @@ class Stack:
             if watch is not None:
                 self.watches.append(watch)
 
-    def _freeze_layer(self, freezer: Freezer, layer: Layer, monitor: bool) -> FrozenLayer:
+    def _capture_layer(self, capture: Capture, layer: Layer, monitor: bool) -> CapturedLayer:
         env, adapter = layer.env, self._adapters.get(id(layer.env))
         adapted = None if adapter is None else (adapter.capture(env),)
         attributes = own = cls = None
         if adapter is None or adapter.with_attributes:
-            attributes = freeze_attributes(freezer, env, layer.not_state, adapter is not None)
+            attributes = capture_attributes(capture, env, layer.not_state, adapter is not None)
         if layer.monitor and monitor:
-            own = freeze_attributes(freezer, env, _all_but_remembered(layer), False)
+            own = capture_attributes(capture, env, _all_but_remembered(layer), False)
         if adapter is None:
-            cls = freezer.freeze(layer.cls)
-        return FrozenLayer(
+            cls = capture(layer.cls)
+        return CapturedLayer(
             layer.name, layer.left_out, adapted, attributes, own, cls if type(cls) is Ref else None
         )
 
-    def check(self, frozen: tuple[FrozenLayer, ...]) -> None:
+    def check(self, captured: tuple[CapturedLayer, ...]) -> None:
         """Refuse the state of other layers.
 
-        :param frozen: captured layers.
+        :param captured: captured layers.
         :raises SnapshotMismatchError: names the difference.
         """
-        check(self.layers, frozen)
+        check(self.layers, captured)
 
-    def thaw(self, frozen: tuple[FrozenLayer, ...], nodes: tuple[Node, ...], rng: RngMode) -> None:
+    def restore(self, captured: tuple[CapturedLayer, ...], nodes: tuple[Node, ...], rng: RngMode) -> None:
         """Put the layers into a captured state.
 
-        :param frozen: captured layers; :meth:`check` has passed.
+        :param captured: captured layers; :meth:`check` has passed.
         :param nodes: the nodes that their values refer to.
         :param rng: what becomes of random generators.
         :raises SnapshotMismatchError: if the state does not fit; nothing has been changed then.
         """
-        self._thaw(frozen, nodes, rng, None)
+        self._restore(captured, nodes, rng, None)
 
-    def _thaw(
+    def _restore(
         self,
-        frozen: tuple[FrozenLayer, ...],
+        captured: tuple[CapturedLayer, ...],
         nodes: tuple[Node, ...],
         rng: RngMode,
         originals: list[Any] | None,
         foreign: frozenset[int] = frozenset(),
     ) -> None:
-        layers = pair(self.layers, frozen)
+        layers = pair(self.layers, captured)
         known = [layer.env if layer is not None else None for layer in layers]
         for place in reversed(range(len(known) - 1)):
             if known[place] is None:
                 known[place] = known[place + 1]
         places = Places(self._watched or ())
         while True:
-            thawer = Thawer(nodes, HANDLERS, known, rng, originals, places, foreign)
-            self._plan(thawer, layers, frozen)
-            simulators = [thawer.adapted[index] for index in sorted(thawer.adapted)]
+            restore = Restore(nodes, HANDLERS, known, rng, originals, places, foreign)
+            self._plan(restore, layers, captured)
+            simulators = [restore.adapted[index] for index in sorted(restore.adapted)]
             if places.are_of(simulators):
                 break
             places = Places(simulators)
-        thawer.commit()
+        restore.commit()
 
-    def _plan(self, thawer: Thawer, layers: list[Layer | None], frozen: tuple[FrozenLayer, ...]) -> None:
-        for layer, captured in zip(layers, frozen, strict=True):
+    def _plan(
+        self, restore: Restore, layers: list[Layer | None], captured: tuple[CapturedLayer, ...]
+    ) -> None:
+        for layer, saved in zip(layers, captured, strict=True):
             if layer is None:
                 continue
             adapter = self._adapters.get(id(layer.env))
-            if captured.adapted is not None:
-                plan_adapter(thawer, adapter, layer.env, captured.adapted[0])
-            thawer.thaw(captured.cls, layer.cls)
-            if captured.attributes is not None:
-                thaw_attributes(thawer, layer.env, layer.not_state, captured.attributes, adapter is None)
-            if captured.own is not None and layer.monitor:
-                thaw_attributes(thawer, layer.env, _all_but_remembered(layer), captured.own, False)
+            if saved.adapted is not None:
+                plan_adapter(restore, adapter, layer.env, saved.adapted[0])
+            restore(saved.cls, layer.cls)
+            if saved.attributes is not None:
+                restore_attributes(restore, layer.env, layer.not_state, saved.attributes, adapter is None)
+            if saved.own is not None and layer.monitor:
+                restore_attributes(restore, layer.env, _all_but_remembered(layer), saved.own, False)
 
     def clone(self) -> gym.Env[Any, Any]:
         """Copy the layers; those that only monitor, draw or record are stand-ins in the copy.
@@ -273,11 +275,11 @@ class Stack:
                     copies[id(layer.env)] = adapter.clone(layer.env, copier.copy)
         outermost = copies[id(self._owner)] = copies[id(self.layers[0].env)]
         # Simulators first, wherever they hang: attributes may be views into their memory.
-        freezer = Freezer(handler_of, self._refs, len(self.layers))
-        frozen = [self._freeze_layer(freezer, layer, monitor=False) for layer in ordinary]
+        capture = Capture(handler_of, self._refs, len(self.layers))
+        captured = [self._capture_layer(capture, layer, monitor=False) for layer in ordinary]
         if not self.incomplete_clones:  # those are completed by what keep() has checked
-            check_held(freezer, frozen)
-        for simulator in freezer.adapted:
+            check_held(capture, captured)
+        for simulator in capture.adapted:
             copier.copy(simulator)
         for layer in ordinary:
             _copy_attributes(copier, layer)

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
-from sb3_mcbs.snapshot.object_graph import MISSING, Copier, Freezer, Ref, Thawer, class_name
-from sb3_mcbs.snapshot.objects import copy_content, freeze_content, thaw_content
+from sb3_mcbs.snapshot.object_graph import MISSING, Capture, Copier, Ref, Restore, class_name
+from sb3_mcbs.snapshot.objects import capture_content, copy_content, restore_content
 
 
 def is_tensor(obj: Any) -> bool:
@@ -38,35 +38,35 @@ class TensorHandler:
 
     name = "torch"
 
-    def freeze(self, freezer: Freezer, obj: Any) -> Any:
+    def capture(self, capture: Capture, obj: Any) -> Any:
         storage = _storage_of(obj)
-        freezer.tensors.append(obj)
-        shared = freezer.owner_of(storage, obj)
+        capture.tensors.append(obj)
+        shared = capture.owner_of(storage, obj)
         content = bytes_of(obj).copy() if shared is None else shared
-        grad = freezer.freeze(obj.grad if obj.is_leaf else None)
-        return content, _layout(obj), grad, freeze_content(freezer, obj)
+        grad = capture(obj.grad if obj.is_leaf else None)
+        return content, _layout(obj), grad, capture_content(capture, obj)
 
-    def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
+    def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
         content, layout, grad, attributes = payload
         if type(content) is Ref:
-            storage = thawer.thaw(content).untyped_storage()
-            stays = thawer.is_original(index, current) and current.untyped_storage() is storage
+            storage = restore(content).untyped_storage()
+            stays = restore.is_original(index, current) and current.untyped_storage() is storage
             made = current if stays else _tensor(storage, layout)
         elif (
-            (layout[0] or thawer.is_original(index, current))
+            (layout[0] or restore.is_original(index, current))
             and _can_be_put_back(current, layout, content)
-            and thawer.claim(current)
+            and restore.claim(current)
         ):
             made = current
-            thawer.do_then(_write, current, content)
+            restore.do_then(_write, current, content)
         else:
             made = _tensor(_storage(content, layout), layout)
-        thawer.memo[index] = made
+        restore.memo[index] = made
         have = made.grad if made is current and made.grad is not None else MISSING
-        thawed = thawer.thaw(grad, have)
-        if thawed is not made.grad:
-            thawer.do_then(setattr, made, "grad", thawed)
-        thaw_content(thawer, attributes, made)
+        restored = restore(grad, have)
+        if restored is not made.grad:
+            restore.do_then(setattr, made, "grad", restored)
+        restore_content(restore, attributes, made)
         return made
 
     def copy(self, copier: Copier, obj: Any) -> Any:
@@ -100,14 +100,14 @@ def _storage_of(tensor: Any) -> Any:
     return tensor.untyped_storage()
 
 
-def check_memory(freezer: Freezer) -> None:
+def check_memory(capture: Capture) -> None:
     """Refuse tensors whose memory is that of a NumPy array: a restore would part the two.
 
-    :param freezer: has captured all that belongs together.
+    :param capture: has captured all that belongs together.
     :raises SnapshotUnsupportedError: if there is one.
     """
-    spans = [_span(tensor.untyped_storage()) for tensor in freezer.tensors if tensor.device.type == "cpu"]
-    for array in freezer.objects if spans else ():
+    spans = [_span(tensor.untyped_storage()) for tensor in capture.tensors if tensor.device.type == "cpu"]
+    for array in capture.objects if spans else ():
         if type(array) is np.ndarray and array.base is None and array.nbytes:
             start = int(array.__array_interface__["data"][0])
             if any(start < end and its_start < start + array.nbytes for its_start, end in spans):

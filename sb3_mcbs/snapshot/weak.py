@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
-from sb3_mcbs.snapshot.object_graph import MISSING, Copier, Freezer, Ref, Thawer, class_name
+from sb3_mcbs.snapshot.object_graph import MISSING, Capture, Copier, Ref, Restore, class_name
 
 PROXIES = (weakref.ProxyType, weakref.CallableProxyType)
 
@@ -15,15 +15,15 @@ class ProxyHandler:
 
     name = "proxy"
 
-    def freeze(self, freezer: Freezer, obj: Any) -> Any:
+    def capture(self, capture: Capture, obj: Any) -> Any:
         referent = _referent(obj)
-        return None if referent is MISSING else freezer.freeze(referent)
+        return None if referent is MISSING else capture(referent)
 
-    def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
+    def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
         if payload is None:  # it stood for nothing any more
             return current
         have = _referent(current) if type(current) in PROXIES else MISSING
-        referent = thawer.thaw(payload, have)
+        referent = restore(payload, have)
         return current if referent is have or referent is MISSING else weakref.proxy(referent)
 
     def copy(self, copier: Copier, obj: Any) -> Any:
@@ -48,18 +48,18 @@ class WeakrefHandler:
 
     name = "weakref"
 
-    def freeze(self, freezer: Freezer, obj: Any) -> Any:
+    def capture(self, capture: Capture, obj: Any) -> Any:
         referent = _held_by(obj)
         if referent is None:
             return None
-        freezer.weak = True
-        return freezer.freeze(referent)
+        capture.weak = True
+        return capture(referent)
 
-    def thaw(self, thawer: Thawer, index: int, payload: Any, current: Any) -> Any:
+    def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
         have = current() if type(current) is weakref.ref else MISSING
         if payload is None:
             return current if have is None else weakref.ref(_Gone())
-        referent = thawer.thaw(payload, MISSING if have is None else have)
+        referent = restore(payload, MISSING if have is None else have)
         return current if referent is have or referent is MISSING else weakref.ref(referent)
 
     def copy(self, copier: Copier, obj: Any) -> Any:
@@ -76,14 +76,14 @@ def _held_by(reference: Any) -> Any:
     return reference()
 
 
-def check_held(freezer: Freezer, roots: Iterable[Any]) -> None:
+def check_held(capture: Capture, roots: Iterable[Any]) -> None:
     """Refuse weak references to what nothing else holds: in a copy that would be gone at once.
 
-    :param freezer: has captured all that belongs together.
-    :param roots: the frozen values that the environment consists of.
+    :param capture: has captured all that belongs together.
+    :param roots: the captured values that the environment consists of.
     :raises SnapshotUnsupportedError: if there is one.
     """
-    if not freezer.weak:
+    if not capture.weak:
         return
     seen: set[int] = set()
     waiting = list(roots)
@@ -95,15 +95,15 @@ def check_held(freezer: Freezer, roots: Iterable[Any]) -> None:
             waiting.extend(value.values())
         elif type(value) is Ref and value.index not in seen:
             seen.add(value.index)
-            kind, payload = freezer.nodes[value.index]
+            kind, payload = capture.nodes[value.index]
             if kind != "weakref":
                 waiting.append(payload)
-    for kind, payload in freezer.nodes:
+    for kind, payload in capture.nodes:
         if kind == "weakref" and type(payload) is Ref and payload.index not in seen:
-            if freezer.nodes[payload.index][0] == "known":
+            if capture.nodes[payload.index][0] == "known":
                 continue
             raise SnapshotUnsupportedError(
                 "A weak reference of the environment is to a "
-                f"{class_name(type(freezer.objects[payload.index]))} that nothing else in it holds, so that "
+                f"{class_name(type(capture.objects[payload.index]))} that nothing else in it holds, so that "
                 "it cannot be captured. Keep the object itself in an attribute."
             )

@@ -13,7 +13,7 @@ from sb3_mcbs.snapshot.errors import SnapshotError, SnapshotMismatchError, Snaps
 from sb3_mcbs.snapshot.faults import diverged_step
 from sb3_mcbs.snapshot.layers import describe_space
 from sb3_mcbs.snapshot.object_graph import Node, RngMode, private_copy
-from sb3_mcbs.snapshot.pairing import FrozenLayer
+from sb3_mcbs.snapshot.pairing import CapturedLayer
 from sb3_mcbs.snapshot.pygame_values import display_kept
 from sb3_mcbs.snapshot.replay import Box2DAdapter
 from sb3_mcbs.snapshot.state import Stack
@@ -33,7 +33,7 @@ class Snapshot:
     :ivar last_observation: what the last reset or step had returned, None before the first reset.
     """
 
-    layers: tuple[FrozenLayer, ...]
+    layers: tuple[CapturedLayer, ...]
     nodes: tuple[Node, ...]
     spaces: tuple[str, str]
     last_observation: Any
@@ -102,7 +102,7 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
         self._is_copy = False
         self._spaces = (describe_space(self.observation_space), describe_space(self.action_space))
         # Whatever cannot be captured is better known before training than in the middle of it.
-        self._stack.freeze()
+        self._stack.capture()
         self._own_attributes = frozenset((*vars(self), "_own_attributes"))
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -224,7 +224,7 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
             cannot be captured.
         """
         self.verify()
-        layers, nodes = self._stack.freeze(monitor)
+        layers, nodes = self._stack.capture(monitor)
         return Snapshot(layers, nodes, self._spaces, private_copy(self.last_observation))
 
     def restore(self, snapshot: Snapshot, rng: RngMode = "restore") -> None:
@@ -249,7 +249,7 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
                 raise SnapshotMismatchError(
                     f"The {what} space is {its} in the snapshot and {ours} in this environment."
                 )
-        self._stack.thaw(snapshot.layers, snapshot.nodes, rng)
+        self._stack.restore(snapshot.layers, snapshot.nodes, rng)
         self.last_observation = private_copy(snapshot.last_observation)
         self.episode_clock = (self.episode_clock[0] + 1, 0)
 
@@ -295,8 +295,8 @@ def _clone(stack: Stack) -> SnapshotEnvWrapper:
     copy = SnapshotEnvWrapper(stack.clone(), verify=False)
     copy._is_copy = True
     if stack.incomplete_clones:
-        layers, nodes = stack.freeze(monitor=False)
-        copy._stack.thaw(layers, nodes, "restore")
+        layers, nodes = stack.capture(monitor=False)
+        copy._stack.restore(layers, nodes, "restore")
     return copy
 
 
@@ -318,10 +318,10 @@ class _CheckedEnvironment:
         self._copy = copy
 
     def capture(self) -> Any:
-        return self._named("capturing its state", lambda: self._stack.freeze(monitor=False))
+        return self._named("capturing its state", lambda: self._stack.capture(monitor=False))
 
     def put_back(self, state: Any) -> None:
-        self._named("putting its state back", lambda: self._stack.thaw(state[0], state[1], "restore"))
+        self._named("putting its state back", lambda: self._stack.restore(state[0], state[1], "restore"))
 
     def copy(self) -> "_CheckedEnvironment":
         copy = self._named("making a clone of it", lambda: _clone(self._stack))
