@@ -48,13 +48,13 @@ def make_agent(env_id: str) -> MCBSTD3:
 
 def over_decisions(agent: MCBSTD3, total: int, every: int) -> list[float]:
     """Memory while deciding, with a step of the environment in between."""
-    assert agent._searcher is not None and agent.search_rng is not None and agent.env is not None
+    assert agent.planner is not None and agent.search_rng is not None and agent.env is not None
     observations: Any = agent._last_obs
     seen = []
     for number in range(total + 1):
         if number % every == 0:
             seen.append(resident_mb())
-        result = agent._searcher.search(observations, agent.search_rng)
+        result = agent.planner.search(observations, agent.search_rng)
         observations, *_ = agent.env.step(agent.policy.unscale_action(result.actions))
     agent._last_obs = observations
     return seen

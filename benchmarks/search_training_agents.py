@@ -66,8 +66,8 @@ class PlanningTD3(MCBSTD3):
         return PlanningUpdate(self)
 
     def _sample_action(self, *args: Any, **kwargs: Any) -> tuple[np.ndarray, np.ndarray]:
-        assert self._searcher is not None
-        self._root = self._searcher.read_roots([0])[0]
+        assert self.planner is not None
+        self._root = self.planner.read_roots([0])[0]
         return super()._sample_action(*args, **kwargs)
 
     def _store_transition(self, replay_buffer: ReplayBuffer, *args: Any, **kwargs: Any) -> None:
@@ -100,8 +100,8 @@ class PlanningUpdate(TD3Update):
         return targets
 
     def _plan_again(self) -> None:
-        agent, searcher, buffer = self._agent, self._agent._searcher, self._buffer
-        assert searcher is not None and agent.search_rng is not None
+        agent, planner, buffer = self._agent, self._agent.planner, self._buffer
+        assert planner is not None and agent.search_rng is not None
         rows = buffer.rows[buffer.is_planned[buffer.rows]][:REPLANNED]
         if not len(rows):
             return
@@ -109,11 +109,11 @@ class PlanningUpdate(TD3Update):
         shape = (len(rows), buffer.action_dim)
         observations = buffer.observations[rows, 0]
         decision = Decision(
-            searcher.model,
+            planner.model,
             roots,
             observations,
-            searcher.agent_functions(),
-            searcher.settings,
+            planner.agent_functions(),
+            planner.settings,
             shape,
             agent.search_rng,
         )

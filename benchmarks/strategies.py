@@ -58,7 +58,7 @@ def run_arm(agent: OffPolicyAlgorithm, env_id: str, seeds: range, settings: dict
     """
     env = make_vec_env(env_id, len(seeds), seed=seeds[0], wrapper_class=SnapshotEnvWrapper)
     policy = SearchPolicy(agent, env, seed=seeds[0], **{"n_threads": 1, **settings})
-    searcher, functions = policy.searcher, policy.searcher.agent_functions()
+    planner, functions = policy.planner, policy.planner.agent_functions()
     observations: Any = env.reset()
     running = list(range(len(seeds)))
     rewards: list[list[float]] = [[] for _ in seeds]
@@ -70,16 +70,16 @@ def run_arm(agent: OffPolicyAlgorithm, env_id: str, seeds: range, settings: dict
     while running:
         start, cpu_start = time.perf_counter(), time.process_time()
         if settings.get("rollout_depth") == 0:
-            result = searcher.search(observations[running], policy.rng)
+            result = planner.search(observations[running], policy.rng)
         else:
-            result = searcher.search(observations, policy.rng, running)
-        searcher.note_actions(result.actions)
+            result = planner.search(observations, policy.rng, running)
+        planner.note_actions(result.actions)
         seconds += time.perf_counter() - start
         cpu_seconds += time.process_time() - cpu_start
         simulated += result.simulated_steps
         evaluated += result.critic_evaluations
         invalid += result.invalid_rollouts
-        actions[running] = searcher.unscale(result.actions)
+        actions[running] = planner.unscale(result.actions)
         observations, received, dones, infos = env.step(actions)
         for row, index in enumerate(running):
             rewards[index].append(float(received[index]))

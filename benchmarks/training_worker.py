@@ -112,11 +112,11 @@ def watch_parts(agent: Any) -> Stopwatch:
     stopwatch.watch(agent, "train", "gradient")
     stopwatch.watch(agent.env, "step", "environment")
     stopwatch.watch(agent, "_sample_action", "rest of choosing actions")
-    searcher = getattr(agent, "_searcher", None)
-    if searcher is not None:
-        stopwatch.watch(searcher.model._engine, "step", "simulate")
-        functions = searcher._functions
-        searcher._functions = functions._replace(
+    planner = getattr(agent, "planner", None)
+    if planner is not None:
+        stopwatch.watch(planner.model._engine, "step", "simulate")
+        functions = planner._functions
+        planner._functions = functions._replace(
             policy=stopwatch.wrap(functions.policy, "networks in search"),
             value=stopwatch.wrap(functions.value, "networks in search"),
         )

@@ -205,7 +205,7 @@ def test_a_resumed_run_goes_on_with_the_changed_settings(tmp_path, changes):
     agents = assert_resumed_is_exact(make, tmp_path, more=more)
     for agent in agents:
         assert {name: getattr(agent, name) for name in changes} == changes
-        assert agent._searcher.settings == agent.search_settings
+        assert agent.planner.settings == agent.search_settings
 
 
 def test_settings_of_a_search_policy_are_attributes(make_agent):
@@ -286,16 +286,16 @@ def test_rewards_are_scaled_as_the_critics_learn_them(make_agent):
     for normalize in (False, True):
         env.norm_reward = normalize
         agent.learn(2, reset_num_timesteps=False)
-        assert (agent._searcher.view.scale_reward(rewards) == rewards).all() != normalize
+        assert (agent.planner.view.scale_reward(rewards) == rewards).all() != normalize
 
 
 def test_what_was_noticed_of_the_environment_is_not_forgotten(make_agent):
     agent = make_agent().learn(25)
-    agent._searcher.model.deterministic = False
+    agent.planner.model.deterministic = False
     agent.n_threads = 2
-    assert not agent._searcher.model.deterministic
+    assert not agent.planner.model.deterministic
     agent.beam_width = 4
-    assert not agent._searcher.model.deterministic
+    assert not agent.planner.model.deterministic
 
 
 def test_an_environment_that_cannot_be_searched_in_leaves_the_old_one(make_agent):

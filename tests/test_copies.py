@@ -52,9 +52,9 @@ def assert_same_future(original, other, steps: int = 30) -> None:
 def test_a_copy_goes_on_as_the_original_does(make_agent, cls, make_copy):
     original = make_agent(cls=cls).learn(45)  # in the middle of an episode
     other = make_copy(original)
-    assert other.env is not original.env and other._searcher.agent is other
+    assert other.env is not original.env and other.planner.agent is other
     assert_same_future(original, other)
-    assert other._searcher.environments.wrappers[0] is other.env.envs[0] is not original.env.envs[0]
+    assert other.planner.environments.wrappers[0] is other.env.envs[0] is not original.env.envs[0]
 
 
 HANDLERS = {
@@ -89,7 +89,7 @@ def test_a_learned_model_goes_on(make_agent, make_copy):
     original = make_agent(**settings, ensemble_gradient_steps=20, ensemble_max_error=100.0).learn(150)
     other = make_copy(original)
     assert_same_future(original, other, 60)
-    assert other._searcher._ensemble_model.ensemble is other.learned_model.ensemble
+    assert other.planner._ensemble_model.ensemble is other.learned_model.ensemble
     assert other.learned_model.ensemble is not original.learned_model.ensemble
 
 
@@ -101,7 +101,7 @@ def test_normalized_environments_are_given_to_a_copy_as_with_sb3(make_agent, mak
     other = make_copy(original)
     observations = np.ones((1, 3), np.float32)
     np.testing.assert_array_equal(other.predict(observations)[0], original.predict(observations)[0])
-    for do in (lambda: other.learn(10, reset_num_timesteps=False), lambda: other._searcher.model):
+    for do in (lambda: other.learn(10, reset_num_timesteps=False), lambda: other.planner.model):
         with pytest.raises(ValueError, match=r"no environments in this VecNormalize.*set_venv"):
             do()
     other = make_copy(original)
@@ -206,14 +206,14 @@ def test_a_copy_is_no_fork(make_agent, monkeypatch):
 
 def test_what_was_noticed_of_environments_stays_known(make_agent):
     original = make_agent("InvertedPendulum-v5").learn(25)
-    original._searcher._go_on_with("pool", False)
+    original.planner._go_on_with("pool", False)
     other = copy.deepcopy(original)
-    assert (other._searcher.model.kind, other._searcher.model.deterministic) == ("pool", False)
+    assert (other.planner.model.kind, other.planner.model.deterministic) == ("pool", False)
     third = copy.deepcopy(copy.deepcopy(original))
-    assert (third._searcher.model.kind, third._searcher.model.deterministic) == ("pool", False)
-    copy.deepcopy(original)._searcher.close()
+    assert (third.planner.model.kind, third.planner.model.deterministic) == ("pool", False)
+    copy.deepcopy(original).planner.close()
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
-        other._searcher.nothing  # noqa: B018
+        other.planner.nothing  # noqa: B018
 
 
 def test_other_processes_are_refused_as_by_sb3(make_agent):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sb3_mcbs import MCBSTD3, SearchPolicy, SearchSettings
-from sb3_mcbs.search import Agent, LatencyForecast, beam_search, deadline_search
+from sb3_mcbs.search import LatencyForecast, PolicyFunctions, beam_search, deadline_search
 from sb3_mcbs.search.beam import Noise
 from tests.conftest import snapshot_vec_env
 from tests.fake_model import LineWorld
@@ -32,7 +32,7 @@ class SlowWorld(LineWorld):
         return super().step(actions)
 
 
-AGENT = Agent(
+AGENT = PolicyFunctions(
     policy=lambda observations: np.zeros((len(observations), 1), dtype=np.float32),
     value=lambda observations, actions: -np.abs(observations[:, 0]).astype(np.float32),
     gamma=0.9,
@@ -210,7 +210,7 @@ def test_searches_of_some_environments_do_not_spoil_the_forecasts_of_all():
         "MlpPolicy", snapshot_vec_env("HalfCheetah-v5", 3), time_budget=0.05, seed=0, device="cpu"
     )
     agent._setup_learn(1)
-    searcher = agent._searcher
+    planner = agent.planner
     for envs in ([0], [0, 1, 2], [2]):
-        searcher.search(agent._last_obs, agent.search_rng, envs)
-    assert {n_envs for n_envs, _ in searcher._paces} == {1, 3}
+        planner.search(agent._last_obs, agent.search_rng, envs)
+    assert {n_envs for n_envs, _ in planner._paces} == {1, 3}

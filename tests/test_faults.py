@@ -442,7 +442,7 @@ def test_a_worker_that_is_missing_when_the_search_needs_it(make_agent) -> None:
     with pytest.raises(WorkerError, match="environment 0 was killed by SIGKILL"):
         agent.learn(100, callback=KillFirst())
     assert closes_at_once(vec_env)
-    agent._searcher.close()
+    agent.planner.close()
 
 
 def test_errors_that_are_no_worker_s(make_agent) -> None:
@@ -505,9 +505,9 @@ def test_invalid_decisions_are_counted_in_a_row(make_agent, caplog) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for result in [invalid] * 9 + [found] + [invalid] * 9 + [found._replace(chosen=np.array([-1]))]:
-            decisions.note(result, agent._searcher.model)
+            decisions.note(result, agent.planner.model)
     for _ in range(9):
-        decisions.note(invalid, agent._searcher.model)
+        decisions.note(invalid, agent.planner.model)
     with pytest.warns(UserWarning, match="last 10 decisions .* They diverged"):
-        decisions.note(invalid, agent._searcher.model)
+        decisions.note(invalid, agent.planner.model)
     assert "Traceback" not in caplog.text

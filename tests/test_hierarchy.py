@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sb3_mcbs import MCBSTD3, SearchPolicy, SearchSettings
-from sb3_mcbs.agents.planner import Searcher
+from sb3_mcbs.agents.planner import Planner
 from sb3_mcbs.search import (
     Decision,
     RecentActions,
@@ -212,10 +212,10 @@ def test_real_environments(env_id, settings):
     recent = rng.normal(size=(ENOUGH, act_dim)).astype(np.float32)
     directions = reference_strategies.principal_directions(recent, settings.proposal_dims)
     directions = directions.astype(np.float32)
-    searcher = Searcher(agent, vec_env, settings)
+    planner = Planner(agent, vec_env, settings)
     observations = walk(vec_env, 5, rng)
     reference = reference_for(agent, vec_env.envs[0])
-    given = searcher.model, searcher.model.read_roots([0]), observations, searcher.agent_functions(), settings
+    given = planner.model, planner.model.read_roots([0]), observations, planner.agent_functions(), settings
     if settings.strategy == "beam":
         noise = draw_noise(rng, settings, 1, act_dim, directions=directions)
         result = beam_search(*given, noise, rng)
@@ -235,7 +235,7 @@ def test_real_environments(env_id, settings):
         np.testing.assert_allclose(plans[0], outcome.plan, rtol=1e-4, atol=1e-6)
     assert_agree(result, 0, outcome)
     assert result.simulated_steps == outcome.steps
-    searcher.close()
+    planner.close()
 
 
 def test_candidates_lie_in_the_learned_directions():
@@ -251,7 +251,7 @@ def test_candidates_lie_in_the_learned_directions():
         observations, *_ = vec_env.step(actions)
     assert ranks == [6] * (ENOUGH // 2) + [2]
     vec_env.reset()
-    assert policy.searcher.recent_actions.directions(2) is not None, "an episode's end forgets nothing"
+    assert policy.planner.recent_actions.directions(2) is not None, "an episode's end forgets nothing"
     policy.close()
     with pytest.raises(ValueError, match="proposal_dims must be at most 6"):
         SearchPolicy(agent, vec_env, proposal_dims=7)
@@ -298,10 +298,10 @@ def test_an_agent_remembers_its_actions_when_it_is_loaded(make_agent, tmp_path):
     loaded = MCBSTD3.load(tmp_path / "agent", env=snapshot_vec_env("Pendulum-v1"))
     state = agent.recent_actions.state()
     np.testing.assert_array_equal(loaded.recent_actions.state()["actions"], state["actions"])
-    assert loaded._searcher.recent_actions is loaded.recent_actions
+    assert loaded.planner.recent_actions is loaded.recent_actions
     policy = SearchPolicy(loaded, snapshot_vec_env("Pendulum-v1"), seed=0)
     policy.predict(policy.vec_env.reset())
-    assert len(policy.searcher.recent_actions) == 111 and len(loaded.recent_actions) == 110
+    assert len(policy.planner.recent_actions) == 111 and len(loaded.recent_actions) == 110
     loaded.learn(5, reset_num_timesteps=False)
     assert len(loaded.recent_actions) == 115
 
@@ -314,7 +314,7 @@ def test_a_run_that_is_resumed_remembers_its_actions(make_agent, tmp_path):
     both = assert_resumed_is_exact(
         make, tmp_path, 150, 105, make_env=lambda folder: snapshot_vec_env("Pendulum-v1", 2)
     )
-    states = [agent._searcher.recent_actions.state() for agent in both]
+    states = [agent.planner.recent_actions.state() for agent in both]
     np.testing.assert_array_equal(states[0]["actions"], states[1]["actions"])
     assert states[0]["count"] == states[1]["count"] == 130
-    assert all(agent._searcher.recent_actions is agent.recent_actions for agent in both)
+    assert all(agent.planner.recent_actions is agent.recent_actions for agent in both)

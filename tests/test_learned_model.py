@@ -70,7 +70,7 @@ def test_the_environment_cannot_be_captured():
 @pytest.mark.parametrize("cls", SEARCHING)
 def test_agents_search_without_snapshots(learning_agent, no_snapshots, cls):
     agent = learning_agent(cls=cls, action_noise=deepcopy(NOISE))
-    assert "learned ensemble of 2 networks" in agent._searcher.description
+    assert "learned ensemble of 2 networks" in agent.planner.description
     agent.learn(160, log_interval=1000)
     logged = agent.logger.name_to_value
     assert logged["search/model_ready"] == 1 and logged["model/held_out_error"] < 0.8
@@ -102,7 +102,7 @@ def test_it_is_put_aside_while_its_error_is_too_high(learning_agent):
     agent.learn(140)
     assert agent.n_decisions == 39
     agent.learned_model.ensemble.held_out_error = 0.81
-    assert not agent._searcher.ready
+    assert not agent.planner.ready
     policy = SearchPolicy(agent, agent.env)
     observation = agent.env.reset()
     actions, _ = policy.predict(observation)

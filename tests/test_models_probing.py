@@ -156,17 +156,17 @@ def aimed(cls: type = Aimed) -> DummyVecEnv:
 
 def test_an_agent_whose_environment_needs_options(make_agent) -> None:
     agent = make_agent(aimed())
-    assert "show after the first reset" in agent._searcher.description
+    assert "show after the first reset" in agent.planner.description
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         agent.learn(60)
-    assert agent._searcher.model.deterministic and agent.n_decisions > 0
-    assert agent._searcher.description.startswith("pool of environment copies (deterministic dynamics)")
+    assert agent.planner.model.deterministic and agent.n_decisions > 0
+    assert agent.planner.description.startswith("pool of environment copies (deterministic dynamics)")
 
 
 def test_random_dynamics_that_show_after_the_first_reset(make_agent) -> None:
     agent = make_agent(aimed(RandomAimed)).learn(60)
-    assert not agent._searcher.model.deterministic
+    assert not agent.planner.model.deterministic
     single = make_agent(aimed(RandomAimed), n_simulations=1, strategy="tree")
     with pytest.raises(ValueError, match="random"):
         single.learn(60)
@@ -235,7 +235,7 @@ class NoShape(Point):
 
 def test_actions_that_are_single_numbers(make_agent) -> None:
     agent = make_agent(TimeLimit(NoShape(), 15)).learn(40)
-    assert agent._searcher.model.deterministic and agent.n_decisions > 0
+    assert agent.planner.model.deterministic and agent.n_decisions > 0
     env = SnapshotEnvWrapper(NoShape())
     env.reset(seed=0)
     model = pool(env)
@@ -280,7 +280,7 @@ def test_time_limits_stop_nothing() -> None:
 def test_agents_learn_where_the_environment_truncates(make_agent, settings) -> None:
     agent = make_agent(Point(last=7), **{"learning_starts": 10, **settings}).learn(60)
     assert agent.n_decisions > 0 and agent.replay_buffer.timeouts.sum() == 8
-    assert agent._searcher.model.deterministic
+    assert agent.planner.model.deterministic
     policy = SearchPolicy(agent, DummyVecEnv([lambda: Point(last=1)]), seed=0, rollout_depth=3)
     policy.predict(policy.vec_env.reset())
     assert np.isfinite(policy.last_result.values).all()

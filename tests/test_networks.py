@@ -167,6 +167,6 @@ def test_actions_are_unscaled_as_sb3_does_it_to_the_bit(low, high):
     env = gym.wrappers.RescaleAction(gym.make("Pendulum-v1"), np.float32(low), np.float32(high))
     agent = MCBSTD3("MlpPolicy", env, **SMALL)
     actions = np.random.default_rng(0).uniform(-1, 1, (5000, 1)).astype(np.float32)
-    found = agent._searcher.unscale(actions)
+    found = agent.planner.unscale(actions)
     assert found.dtype == np.float32
     np.testing.assert_array_equal(found, agent.policy.unscale_action(actions))

@@ -86,16 +86,16 @@ def test_a_search_is_around_the_present_actor(make_agent, cls, change):
     plain = make_agent(cls=WITHOUT_SEARCH[cls])
     policy = SearchPolicy(plain, snapshot_vec_env("Pendulum-v1"), seed=0, include_policy_action=True)
     training = make_agent(snapshot_vec_env("Pendulum-v1"), cls=cls, include_policy_action=True)
-    for agent, searcher, vec_env in (
-        (plain, policy.searcher, policy.vec_env),
-        (training, training._searcher, training.env),
+    for agent, planner, vec_env in (
+        (plain, policy.planner, policy.vec_env),
+        (training, training.planner, training.env),
     ):
         observations = vec_env.reset()
         rng = np.random.default_rng(0)
         before = scaled_action(agent, observations)
-        assert abs(searcher.search(observations, rng).candidates - before).min() < 1e-6
+        assert abs(planner.search(observations, rng).candidates - before).min() < 1e-6
         SEARCHED[change](agent)
-        result = searcher.search(observations, rng)
+        result = planner.search(observations, rng)
         found = abs(result.candidates - scaled_action(agent, observations)).min(axis=1)
         np.testing.assert_allclose(found, 0, atol=1e-6)
         assert abs(result.candidates - before).min() > 1e-6
@@ -119,9 +119,9 @@ def hook_of_a_critic(agent):
 def test_values_are_those_of_the_present_critics(make_agent, cls, change):
     agent = make_agent(cls=cls, rollout_depth=0, n_simulations=1)
     observations = agent.env.reset()
-    agent._searcher.search(observations, np.random.default_rng(0))
+    agent.planner.search(observations, np.random.default_rng(0))
     change(agent)
-    result = agent._searcher.search(observations, np.random.default_rng(0))
+    result = agent.planner.search(observations, np.random.default_rng(0))
     agent.policy.set_training_mode(False)
     seen = np.repeat(observations, result.candidates.shape[1], axis=0)
     with th.no_grad():
@@ -137,7 +137,7 @@ def test_actions_are_unscaled_by_the_present_policy(make_agent):
     policy.predict(observations)
     agent.policy.unscale_action = lambda actions: np.full_like(actions, 0.125)
     assert (policy.predict(observations)[0] == 0.125).all()
-    assert (policy.searcher.agent_functions().unscale_action(np.ones((4, 1))) == 0.125).all()
+    assert (policy.planner.agent_functions().unscale_action(np.ones((4, 1))) == 0.125).all()
     agent.policy = deepcopy(make_agent(cls=TD3).policy)
     assert (policy.predict(observations)[0] != 0.125).all()
 
@@ -146,7 +146,7 @@ def test_actions_are_unscaled_by_the_present_policy(make_agent):
 def test_expanded_targets_are_those_of_the_actor_that_is_trained(make_agent, cls):
     agent = make_agent("Hopper-v5", cls=cls, value_expansion=1)
     observations = np.random.default_rng(0).standard_normal((4, 11)).astype(np.float32)
-    expansion = ValueExpansion(agent, agent._searcher)
+    expansion = ValueExpansion(agent, agent.planner)
     before = expansion._acting()(observations, np.random.default_rng(0))[0]
     th.manual_seed(3)
     name = "actor_target" if cls is MCBSTD3 else "actor"

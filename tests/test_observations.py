@@ -68,6 +68,6 @@ def test_nothing_seems_to_differ(make_agent, form, vec_env_cls, normalized) -> N
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)  # as "differs from reality" would be one
         agent.learn(80)
-    assert agent.n_decisions == 60 and agent._searcher.model.deterministic
+    assert agent.n_decisions == 60 and agent.planner.model.deterministic
     assert agent.replay_buffer.timeouts[:40].sum() == 6, "ends of episodes were among them"
     vec_env.close()

@@ -85,9 +85,9 @@ def test_decisions_start_around_what_is_left_of_the_last_plan():
 REFINE = dict(strategy="refine", beam_width=4, rollout_depth=3, n_rounds=2, n_simulations=1, beam_noise=0.3)
 
 
-def recalled(searcher) -> np.ndarray:
-    everywhere = searcher._all_envs
-    return searcher._plans.recall(everywhere, searcher._episode_clocks(everywhere))
+def recalled(planner) -> np.ndarray:
+    everywhere = planner._all_envs
+    return planner._plans.recall(everywhere, planner._episode_clocks(everywhere))
 
 
 @pytest.mark.parametrize("vec_env_cls", [DummyVecEnv, SubprocVecEnv])
@@ -97,17 +97,17 @@ def test_episodes_of_vectorized_environments(make_agent, vec_env_cls):
     env = snapshot_vec_env("InvertedPendulum-v5", 2, vec_env_cls=vec_env_cls)
     policy = SearchPolicy(agent, env, seed=0, **REFINE)
     observations = env.reset()
-    assert not recalled(policy.searcher).any()
+    assert not recalled(policy.planner).any()
     ends = [0, 0]
     for _ in range(25):
         policy.predict(observations)
         # Full force to either side, so that both poles fall, one after the other.
         observations, _, dones, _ = env.step(np.array([[3.0], [-2.0]], dtype=np.float32))
-        np.testing.assert_array_equal(recalled(policy.searcher).any(axis=(1, 2)), ~dones)
+        np.testing.assert_array_equal(recalled(policy.planner).any(axis=(1, 2)), ~dones)
         ends = [count + int(done) for count, done in zip(ends, dones, strict=True)]
     assert min(ends) > 0
     env.reset()
-    assert not recalled(policy.searcher).any()
+    assert not recalled(policy.planner).any()
     policy.close()
     env.close()
 
@@ -125,7 +125,7 @@ def test_a_seed_gives_the_same_returns_whatever_was_before(make_agent):
     policy = SearchPolicy(agent, env, **REFINE)
     first, other, again = (episode(policy, seed) for seed in (1, 2, 1))
     assert first == again != other
-    assert policy.searcher.memory["plans"]["plans"].any(), "there were plans to be dropped"
+    assert policy.planner.memory["plans"]["plans"].any(), "there were plans to be dropped"
     policy.close()
 
 
@@ -141,20 +141,20 @@ def test_a_restored_search_goes_on_as_if_it_had_never_stopped(make_agent):
     for _ in range(3):
         actions, _ = policy.predict(observations)
         observations, *_ = env.step(actions)
-    memory, snapshot = policy.searcher.memory, env.envs[0].snapshot()
+    memory, snapshot = policy.planner.memory, env.envs[0].snapshot()
     assert memory["plans"]["ages"] == [1] and memory["plans"]["plans"].any()
 
     env_b, policy_b, _ = start()
     env_b.envs[0].restore(snapshot)
-    policy_b.searcher.memory = memory
+    policy_b.planner.memory = memory
     policy_b.rng.bit_generator.state = policy.rng.bit_generator.state
-    np.testing.assert_array_equal(recalled(policy_b.searcher), recalled(policy.searcher))
+    np.testing.assert_array_equal(recalled(policy_b.planner), recalled(policy.planner))
     expected, _ = policy.predict(observations)
     actions, _ = policy_b.predict(observations)
     np.testing.assert_array_equal(actions, expected)
     for strategy in ("beam", "tree"):
         other = SearchPolicy(agent, env, strategy=strategy, rollout_depth=2)
-        assert other.searcher.memory["plans"] is None
+        assert other.planner.memory["plans"] is None
         other.close()
 
 
@@ -170,7 +170,7 @@ def test_agents_train_with_every_strategy(make_agent, strategy, make_dict_env):
     )
     agent.learn(28)  # later this actor is at its limits, where the best plan is to leave it alone
     assert agent.n_decisions == 8 and agent.n_simulated_steps > 0
-    state = agent._searcher.memory["plans"]
+    state = agent.planner.memory["plans"]
     if strategy == "tree":
         assert state is None
     else:
@@ -196,4 +196,4 @@ def test_a_run_that_is_resumed_remembers_its_plans(make_agent, tmp_path, env_id,
     )
     (state,) = restored
     assert state["ages"] == [1] * n_envs and state["plans"].any(axis=(1, 2)).all()
-    np.testing.assert_array_equal(*(recalled(agent._searcher) for agent in (whole, resumed)))
+    np.testing.assert_array_equal(*(recalled(agent.planner) for agent in (whole, resumed)))

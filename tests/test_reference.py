@@ -11,7 +11,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_mcbs import MCBSDDPG, MCBSSAC, MCBSTD3, MCBSTQC, SearchSettings
-from sb3_mcbs.agents.planner import Searcher
+from sb3_mcbs.agents.planner import Planner
 from sb3_mcbs.search import beam_search, draw_noise
 from tests.conftest import SMALL
 from tests.reference_search import Reference
@@ -93,15 +93,15 @@ def assert_same_values_and_choice(cls, agent_settings, env_id, kwargs, kind, ste
     vec_env.seed(3)
     settings = SearchSettings(4, 3, 3, beam_noise=0.4, n_threads=1, forward_model=kind)
     agent = cls("MlpPolicy", vec_env, seed=1, rollout_depth=0, **agent_settings)
-    searcher = Searcher(agent, vec_env, settings)
+    planner = Planner(agent, vec_env, settings)
     rng = np.random.default_rng(0)
     terminated_inside = False
     for trial in range(4):
         observations = walk(vec_env, steps + trial, rng)
-        roots = searcher.model.read_roots([0])
+        roots = planner.model.read_roots([0])
         noise = draw_noise(rng, settings, 1, vec_env.action_space.shape[0])
         result = beam_search(
-            searcher.model, roots, observations, searcher.agent_functions(), settings, noise, rng
+            planner.model, roots, observations, planner.agent_functions(), settings, noise, rng
         )
         reference = reference_for(agent, vec_env.envs[0])
         chosen, values, rewards = reference.choose(observations[0], noise.beam[0], noise.rollout[:, 0])
@@ -118,17 +118,17 @@ def test_rewards_are_exact():
     vec_env.seed(0)
     settings = SearchSettings(4, 4, 1, beam_noise=0.3, n_threads=2, forward_model="mujoco")
     agent = MCBSTD3("MlpPolicy", vec_env, seed=1, rollout_depth=0, **SMALL)
-    searcher = Searcher(agent, vec_env, settings)
+    planner = Planner(agent, vec_env, settings)
     rng = np.random.default_rng(5)
     observations = walk(vec_env, 6, rng)
     # A policy that is the same constant in both makes the actions bit-identical, whatever the batch size.
     constant = np.zeros((1, vec_env.action_space.shape[0]), dtype=np.float32)
-    functions = searcher.agent_functions()._replace(
+    functions = planner.agent_functions()._replace(
         policy=lambda obs: np.repeat(constant, len(obs), axis=0),
         value=lambda obs, actions: np.zeros(len(actions)),
     )
-    roots, noise = searcher.model.read_roots([0]), draw_noise(rng, settings, 1, constant.shape[1])
-    result = beam_search(searcher.model, roots, observations, functions, settings, noise, rng)
+    roots, noise = planner.model.read_roots([0]), draw_noise(rng, settings, 1, constant.shape[1])
+    result = beam_search(planner.model, roots, observations, functions, settings, noise, rng)
     reference = reference_for(agent, vec_env.envs[0])
     reference.policy, reference.critics = lambda obs: constant[0], lambda obs, action: [0.0]
     chosen, values, _ = reference.choose(observations[0], noise.beam[0], noise.rollout[:, 0])
@@ -142,15 +142,13 @@ def test_normalised_observations_and_rewards():
     vec_env.seed(0)
     agent = MCBSTD3("MlpPolicy", vec_env, seed=1, rollout_depth=0, **SMALL)
     settings = SearchSettings(3, 2, 2, beam_noise=0.3, n_threads=1)
-    searcher = Searcher(agent, vec_env, settings, normalize_reward=True)
+    planner = Planner(agent, vec_env, settings, normalize_reward=True)
     rng = np.random.default_rng(2)
     walk(vec_env, 9, rng)
     statistics = vec_env.obs_rms.mean.copy(), vec_env.ret_rms.var, vec_env.returns.copy()
     observations = vec_env.get_original_obs()
-    roots, noise = searcher.model.read_roots([0]), draw_noise(rng, settings, 1, 3)
-    result = beam_search(
-        searcher.model, roots, observations, searcher.agent_functions(), settings, noise, rng
-    )
+    roots, noise = planner.model.read_roots([0]), draw_noise(rng, settings, 1, 3)
+    result = beam_search(planner.model, roots, observations, planner.agent_functions(), settings, noise, rng)
 
     reference = reference_for(agent, vec_env.venv.envs[0])
     plain_step = reference.env_step

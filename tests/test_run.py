@@ -52,7 +52,7 @@ def test_trains(make_agent, cls, env_id, depth):
     agent.learn(60)
     assert agent.num_timesteps == 60 and agent.n_decisions == 40
     if depth:
-        assert agent._searcher.model.kind == ("mujoco" if env_id == "HalfCheetah-v5" else "pool")
+        assert agent.planner.model.kind == ("mujoco" if env_id == "HalfCheetah-v5" else "pool")
     first_steps, later_steps = 3, (depth - 1) * 6
     assert agent.n_simulated_steps == (40 * (first_steps + later_steps) if depth else 0)
     after = parameters_of(agent)
@@ -207,8 +207,8 @@ def test_searched_action_is_executed_and_stored_as_it_is(make_agent, cls):
     agent = make_agent(env, cls=cls, action_noise=NormalActionNoise(np.zeros(1), 5.0 * np.ones(1)))
     chosen = []
     agent._setup_learn(1)
-    search = agent._searcher.search
-    agent._searcher.search = lambda *args: chosen.append(search(*args)) or chosen[-1]
+    search = agent.planner.search
+    agent.planner.search = lambda *args: chosen.append(search(*args)) or chosen[-1]
     agent.learn(40)
     assert len(chosen) == 20
     searched = np.concatenate([result.actions for result in chosen])
@@ -252,7 +252,7 @@ def test_an_edited_environment_is_followed(make_agent, tmp_path):
     model.body_mass[:] *= 1.3
     with pytest.warns(UserWarning, match="edited"):
         agent.learn(10, reset_num_timesteps=False)
-    assert agent._searcher.model.kind == "mujoco"
+    assert agent.planner.model.kind == "mujoco"
     agent.logger.dump(1)
     agent.learn(20, reset_num_timesteps=False)
     agent.logger.dump(2)
@@ -262,7 +262,7 @@ def test_an_edited_environment_is_followed(make_agent, tmp_path):
 
 def test_a_model_that_cannot_read_the_environment_any_more_is_rebuilt(make_agent, monkeypatch):
     agent = make_agent("Hopper-v5").learn(30)
-    model = agent._searcher.model
+    model = agent.planner.model
     read_roots, failures = model.read_roots, [ForwardModelError("the environment has another simulator now.")]
 
     def fail_once(env_indices):
@@ -273,7 +273,7 @@ def test_a_model_that_cannot_read_the_environment_any_more_is_rebuilt(make_agent
     monkeypatch.setattr(model, "read_roots", fail_once)
     with pytest.warns(UserWarning, match=r"another simulator now\..*rebuilt"):
         agent.learn(10, reset_num_timesteps=False)
-    assert agent.n_decisions == 20 and agent._searcher.model is model
+    assert agent.n_decisions == 20 and agent.planner.model is model
 
 
 class RandomPush(gym.Wrapper):
@@ -286,7 +286,7 @@ class RandomPush(gym.Wrapper):
 def test_random_dynamics_are_simulated_with_generators_of_their_own(make_agent):
     agent = make_agent(RandomPush(gym.make("Pendulum-v1")))
     agent.learn(40)
-    assert not agent._searcher.model.deterministic
+    assert not agent.planner.model.deterministic
     assert agent.n_simulated_steps == 20 * 3 * 2 * 2
 
 
@@ -294,7 +294,7 @@ def test_a_tree_does_not_follow_the_luckiest_draw_once_dynamics_turn_out_random(
     """The batched simulator is given up for copies first, which are found to be random then."""
     agent = make_agent("InvertedPendulum-v5", strategy="tree", n_simulations=1, branching=2)
     agent.learn(30)
-    assert agent._searcher.model.kind == "mujoco"
+    assert agent.planner.model.kind == "mujoco"
     step = InvertedPendulumEnv.step
     gust = "step", lambda self, action: step(self, action + self.np_random.normal(scale=0.3, size=1))
     monkeypatch.setattr(InvertedPendulumEnv, *gust)

@@ -255,19 +255,17 @@ def test_only_searched_rows_are_read_and_simulated(make_agent, monkeypatch, env_
     """Four environments of which some are searched equal single searches with the same noise."""
     agent = make_agent(snapshot_vec_env(env_id, 4, vec_env_cls=vec_env_cls), learning_starts=8)
     agent.learn(8)
-    searcher, rng = agent._searcher, np.random.default_rng(0)
+    planner, rng = agent.planner, np.random.default_rng(0)
     noise = Draws(
-        draw_noise(np.random.default_rng(2), searcher.settings, 4, int(np.prod(agent.action_space.shape)))
+        draw_noise(np.random.default_rng(2), planner.settings, 4, int(np.prod(agent.action_space.shape)))
     )
     read = []
-    read_roots = searcher.model.read_roots
-    monkeypatch.setattr(
-        searcher.model, "read_roots", lambda envs: read.append(list(envs)) or read_roots(envs)
-    )
+    read_roots = planner.model.read_roots
+    monkeypatch.setattr(planner.model, "read_roots", lambda envs: read.append(list(envs)) or read_roots(envs))
 
     def search(envs):
         monkeypatch.setattr("sb3_mcbs.search.strategies.draw_noise", lambda *args, **kwargs: noise.of(envs))
-        return searcher.search(agent._last_obs, rng, envs)
+        return planner.search(agent._last_obs, rng, envs)
 
     some = search([1, 3])
     assert read == [[1, 3]] and some.actions.shape[0] == 2
@@ -289,8 +287,8 @@ def test_searched_rows_are_executed_as_they_were_simulated(make_agent):
     )
     errors = []
     agent._setup_learn(1)
-    model_error = agent._searcher.model_error
-    agent._searcher.model_error = lambda *args: errors.append(model_error(*args)) or errors[-1]
+    model_error = agent.planner.model_error
+    agent.planner.model_error = lambda *args: errors.append(model_error(*args)) or errors[-1]
     agent.learn(150)
     assert len(errors) > 20 and set(errors) == {0.0}
     assert 30 < agent.n_decisions < 110

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sb3_mcbs.search import Agent, Noise, SearchSettings, beam_search, draw_noise
+from sb3_mcbs.search import Noise, PolicyFunctions, SearchSettings, beam_search, draw_noise
 from tests.fake_model import LineWorld
 from tests.reference_search import Reference
 
@@ -22,7 +22,9 @@ def value(observations, actions):
     return np.minimum(-(observations[:, 0] ** 2) - actions[:, 0], -np.abs(observations[:, 0]) + 0.1)
 
 
-AGENT = Agent(policy, value, GAMMA, unscale_action=lambda action: action, scale_reward=lambda reward: reward)
+AGENT = PolicyFunctions(
+    policy, value, GAMMA, unscale_action=lambda action: action, scale_reward=lambda reward: reward
+)
 
 
 def search(model, roots, settings, noise, agent=AGENT):

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from stable_baselines3.common.noise import NormalActionNoise
 
 from sb3_mcbs import MCBSTD3, MCBSTQC, SearchPolicy, SearchSettings, SnapshotEnvWrapper
-from sb3_mcbs.search import Agent, Decision, LatencyForecast, WarmStart, deadline_search, search
+from sb3_mcbs.search import Decision, LatencyForecast, PolicyFunctions, WarmStart, deadline_search, search
 from tests.conftest import SMALL, snapshot_vec_env
 from tests.fake_model import LineWorld
 
@@ -110,7 +110,7 @@ def test_settings_are_refused_or_search_a_small_world(kwargs: dict[str, Any]) ->
     found = made(kwargs)
     if found is None or not small(found):
         return
-    agent = Agent(
+    agent = PolicyFunctions(
         policy=lambda observations: np.clip(-observations, -1, 1).astype(np.float32),
         value=lambda observations, actions: -(observations[:, 0] ** 2),
         gamma=0.9,

@@ -274,7 +274,7 @@ def test_agents_look_ahead_in_deterministic_copies(make_agent, policy):
         env = gym.wrappers.FlattenObservation(env)
     agent = make_agent(env, policy)
     agent.learn(60)
-    assert "deterministic dynamics" in agent._searcher.description
+    assert "deterministic dynamics" in agent.planner.description
     vec_env = agent.get_env()
     observation = vec_env.reset()
     chosen = [SearchPolicy(agent, vec_env, seed=0).predict(observation)[0] for _ in range(2)]

@@ -6,7 +6,7 @@ import pytest
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_mcbs import MCBSTD3, SearchPolicy, SearchSettings
-from sb3_mcbs.agents.planner import Searcher
+from sb3_mcbs.agents.planner import Planner
 from sb3_mcbs.search import Decision, WarmStart, check_dynamics, search
 from sb3_mcbs.search.refine import draw_plan_noise, first_spread, refine_search
 from sb3_mcbs.search.tree import draw_tree_noise, tree_search
@@ -178,13 +178,13 @@ def test_real_environments(env_id, kwargs, kind, steps):
     tree = SearchSettings(3, 3, 1, strategy="tree", branching=2, **options)
     refine = SearchSettings(4, 3, 1, strategy="refine", n_rounds=2, n_elites=2, **options)
     agent = MCBSTD3("MlpPolicy", vec_env, seed=1, rollout_depth=0, **SMALL)
-    searcher = Searcher(agent, vec_env, tree)
+    planner = Planner(agent, vec_env, tree)
     rng = np.random.default_rng(0)
     fewer_steps = False
     for trial in range(3):
         observations = walk(vec_env, steps + trial, rng)
         reference = reference_for(agent, vec_env.envs[0])
-        given = searcher.model, searcher.model.read_roots([0]), observations, searcher.agent_functions()
+        given = planner.model, planner.model.read_roots([0]), observations, planner.agent_functions()
 
         noise = draw_tree_noise(rng, tree, 1, act_dim)
         result = tree_search(*given, tree, noise, rng)
@@ -347,5 +347,5 @@ def test_dynamics_that_turn_out_to_be_random_end_a_search_of_single_simulations(
     actions, _ = policy.predict(env.reset())
     observations, rewards, _, infos = env.step(actions)
     with pytest.warns(UserWarning, match="random"), pytest.raises(ValueError, match="luckiest"):
-        policy.searcher.model_error(policy.last_result, [0], observations + 1, rewards, infos)
+        policy.planner.model_error(policy.last_result, [0], observations + 1, rewards, infos)
     policy.close()

@@ -98,7 +98,7 @@ def test_samples_are_those_of_a_plain_loop(make_agent, env_id, cls, normalized):
     buffer, env = agent.replay_buffer, snapshot_vec_env(env_id).envs[0]
     env.reset(seed=0)
     rows, envs = (index.ravel() for index in np.meshgrid(np.arange(buffer.size()), np.arange(2)))
-    expansion = ValueExpansion(agent, agent._searcher)
+    expansion = ValueExpansion(agent, agent.planner)
     before = agent.n_simulated_steps
     sample = expansion.sample(len(rows), GAMMA, FixedRows(rows, envs), agent.get_vec_normalize_env())
     simulated, n_terminated, n_ended = 0, 0, 0
@@ -196,8 +196,8 @@ def test_an_edited_simulator_is_followed_without_any_search(make_agent):
     agent.get_env().envs[0].unwrapped.model.actuator_gear[:] *= 0.1
     with pytest.warns(UserWarning, match="edited"):
         agent.learn(10, reset_num_timesteps=False)
-    env, model = agent.get_env().envs[0], agent._searcher.model
-    model.set_roots(agent._searcher.read_roots([0]), np.zeros(1, int), np.random.default_rng(0))
+    env, model = agent.get_env().envs[0], agent.planner.model
+    model.set_roots(agent.planner.read_roots([0]), np.zeros(1, int), np.random.default_rng(0))
     action = np.array([[2.0]], dtype=np.float32)
     np.testing.assert_array_equal(model.step(action).observations[0], env.step(action[0])[0])
 

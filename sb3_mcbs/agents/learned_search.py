@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_mcbs.agents.learned_model import LearnedModel
 from sb3_mcbs.agents.observation_pipeline import ObservationPipeline
-from sb3_mcbs.agents.planner import Searcher
+from sb3_mcbs.agents.planner import Planner
 from sb3_mcbs.models.ensemble import Transitions
 from sb3_mcbs.models.ensemble_model import EnsembleModel
 from sb3_mcbs.search import EpisodeClock, RecentActions, SearchResult, SearchSettings
@@ -19,13 +19,13 @@ from sb3_mcbs.types import Observations, take_rows
 logger = logging.getLogger("sb3_mcbs")
 
 
-def make_searcher(
+def make_planner(
     agent: OffPolicyAlgorithm,
     vec_env: VecEnv,
     settings: SearchSettings,
     normalize_reward: bool | None = None,
     recent_actions: RecentActions | None = None,
-) -> Searcher:
+) -> Planner:
     """Make what searches for an agent.
 
     :param agent: a TD3, DDPG, SAC or TQC agent.
@@ -33,13 +33,13 @@ def make_searcher(
     :param settings: settings of the search.
     :param normalize_reward: see :class:`~sb3_mcbs.SearchPolicy`.
     :param recent_actions: what the agent executed, for ``proposal_dims``; ``None``: nothing yet.
-    :return: a :class:`LearnedSearcher` where a learned model simulates, else a :class:`Searcher`.
+    :return: a :class:`LearnedPlanner` where a learned model simulates, else a :class:`Planner`.
     """
-    searcher = LearnedSearcher if settings.forward_model == "ensemble" else Searcher
-    return searcher(agent, vec_env, settings, normalize_reward, recent_actions)
+    planner = LearnedPlanner if settings.forward_model == "ensemble" else Planner
+    return planner(agent, vec_env, settings, normalize_reward, recent_actions)
 
 
-class LearnedSearcher(Searcher):
+class LearnedPlanner(Planner):
     """Searches from the agent's observations by the model that the agent learned.
 
     The environments may be of any kind: they are neither wrapped nor copied. A refinement starts anew at
@@ -115,7 +115,9 @@ class LearnedSearcher(Searcher):
         nothing = np.full((n_envs, 1), -np.inf)
         return SearchResult(actions, np.full(n_envs, -1), actions[:, None], nothing, None, 0, 0)
 
-    def _look(self, observations: Observations, envs: Sequence[int]) -> tuple[list[Any], Observations]:
+    def capture_roots(
+        self, observations: Observations, envs: Sequence[int]
+    ) -> tuple[list[Any], Observations]:
         self._n_searches += 1
         self._originals = take_rows(self.view.original(observations), np.asarray(envs))
         return list(self._originals), self._originals

@@ -37,8 +37,8 @@ from sb3_mcbs.agents.learned_model import (
     check_learned_model,
     set_up_learned_model,
 )
-from sb3_mcbs.agents.learned_search import make_searcher
-from sb3_mcbs.agents.planner import Searcher
+from sb3_mcbs.agents.learned_search import make_planner
+from sb3_mcbs.agents.planner import Planner
 from sb3_mcbs.agents.schedule import ScheduleSettings, SearchSchedule
 from sb3_mcbs.agents.simulated_batches import SimulatedBatches
 from sb3_mcbs.networks.torch_settings import matmul_precision
@@ -99,7 +99,7 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         self.n_invalid_rollouts = 0
         self.n_critic_evaluations = 0
         self.n_diverged_steps = 0
-        self._searcher: Searcher | None = None
+        self.planner: Planner | None = None
         #: What was executed, and the environments that were searched.
         self._decision: tuple[SearchResult, Sequence[int]] | None = None
         self.rollout_rng: np.random.Generator | None = None
@@ -135,7 +135,7 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         self._simulated_batches = SimulatedBatches(self)
         set_up_learned_model(self)
         if self.env is not None:
-            self._make_searcher(self.env, settings)
+            self._make_planner(self.env, settings)
 
     @property
     def _is_set_up(self) -> bool:
@@ -146,12 +146,12 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         check_learned_model(self)
         if self._simulated_batches is not None and self.replay_buffer is not None:
             self._simulated_batches.check_settings()
-        before = self._searcher
+        before = self.planner
         if before is not None and not before.follow(settings):
             assert self.env is not None
-            self._make_searcher(self.env, settings)
-            assert self._searcher is not None
-            self._searcher.go_on_after(before)
+            self._make_planner(self.env, settings)
+            assert self.planner is not None
+            self.planner.go_on_after(before)
         self._remember_actions(settings)
         assert self._schedule is not None
         self._schedule.settings = schedule
@@ -162,29 +162,29 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         if self.recent_actions is None and settings.proposal_dims is not None:
             self.recent_actions = (
                 RecentActions(get_action_dim(self.action_space))
-                if self._searcher is None
-                else self._searcher.recent_actions
+                if self.planner is None
+                else self.planner.recent_actions
             )
 
-    def _make_searcher(self, env: VecEnv, settings: SearchSettings) -> None:
-        before, self._decision = self._searcher, None
+    def _make_planner(self, env: VecEnv, settings: SearchSettings) -> None:
+        before, self._decision = self.planner, None
         # What this environment's VecNormalize does is what the critics learn from.
         normalizer = unwrap_vec_normalize(env)
         normalize_reward = normalizer is not None and normalizer.norm_reward
-        self._searcher = make_searcher(self, env, settings, normalize_reward, self.recent_actions)
+        self.planner = make_planner(self, env, settings, normalize_reward, self.recent_actions)
         if self._simulated_batches is not None:
             self._simulated_batches.connect()
         if before is not None:
             before.close()
         if self.verbose >= 1:
-            print(f"Forward model: {self._searcher.description}")
+            print(f"Forward model: {self.planner.description}")
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         before = dict(vars(self))
         super().set_env(env, force_reset)
         assert self.env is not None
         try:
-            self._make_searcher(self.env, self.search_settings)
+            self._make_planner(self.env, self.search_settings)
         except Exception:  # the environment of before stays
             vars(self).clear()
             vars(self).update(before)
@@ -194,10 +194,10 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         # As with SB3's agents, networks and environments are those of the original. Settings are not.
         made = type(self).__new__(type(self))
         vars(made).update(vars(self))
-        for name in ("_schedule", "_searcher"):
+        for name in ("_schedule", "planner"):
             vars(made)[name] = copy(vars(self)[name])
-        if made._searcher is not None:
-            made._searcher.agent = made
+        if made.planner is not None:
+            made.planner.agent = made
         if made._simulated_batches is not None:
             made._simulated_batches = SimulatedBatches(made)
         return made
@@ -243,13 +243,13 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         try:
             actions, scaled_actions = super()._sample_action(learning_starts, noise, n_envs)
         except ValueError:  # of torch: a stochastic actor cannot sample where its mean is NaN
-            assert self._searcher is not None and self._last_obs is not None
-            self._searcher.check_networks(self._last_obs)
+            assert self.planner is not None and self._last_obs is not None
+            self.planner.check_networks(self._last_obs)
             raise
         if self.num_timesteps < learning_starts:
             return actions, scaled_actions
-        assert self._schedule is not None and self._searcher is not None
-        if not self._searcher.ready:
+        assert self._schedule is not None and self.planner is not None
+        if not self.planner.ready:
             return actions, scaled_actions
         self.logger.record("search/frequency", self._schedule.share(self._progress))
         executed = self._schedule.draw(self._progress, self.num_timesteps)
@@ -274,13 +274,13 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
     def _search(self, envs: Sequence[int]) -> SearchResult:
         """Search in some environments."""
         assert self._last_obs is not None, "self._last_obs was not set"
-        assert self._searcher is not None and self.search_rng is not None, "learn() needs an environment"
+        assert self.planner is not None and self.search_rng is not None, "learn() needs an environment"
         assert self._schedule is not None
-        effort = self._schedule.settings_at(self._searcher.settings, self._progress)
+        effort = self._schedule.settings_at(self.planner.settings, self._progress)
         if self._vec_normalize_env is not None:
-            self._searcher.normalize_rewards(self._vec_normalize_env.norm_reward)
+            self.planner.normalize_rewards(self._vec_normalize_env.norm_reward)
         start = time.perf_counter()
-        result = self._searcher.search(self._last_obs, self.search_rng, envs, effort)
+        result = self.planner.search(self._last_obs, self.search_rng, envs, effort)
         self._record_decision(result, time.perf_counter() - start, effort)
         return result
 
@@ -300,7 +300,7 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         infos: list[dict[str, Any]],
     ) -> None:
         raw_reward = self._note_step(reward, dones)
-        assert self._searcher is not None
+        assert self.planner is not None
         diverged = diverged_environments(infos)
         if diverged and self.n_diverged_steps == 0:
             warn_of_divergence(buffer_action, diverged, self.num_timesteps)
@@ -310,11 +310,11 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
             leave_out_step(self, replay_buffer, new_obs)
             return
         if self.num_timesteps - self.n_envs >= self.learning_starts:  # random actions have no directions
-            self._searcher.note_actions(buffer_action)
+            self.planner.note_actions(buffer_action)
         assert self._simulated_batches is not None
         error = self._simulated_batches.model_error(buffer_action, new_obs, raw_reward, infos)
         if error is None and self._decision is not None:
-            error = self._searcher.model_error(*self._decision, new_obs, raw_reward, infos)
+            error = self.planner.model_error(*self._decision, new_obs, raw_reward, infos)
         if error is not None:
             self.logger.record_mean("search/model_error", error)
         self._simulated_batches.store(replay_buffer.pos, dones)
@@ -449,8 +449,8 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         assert self.env is not None, "learn() needs an environment: call set_env()"
         if tb_log_name is None:
             tb_log_name = type(self).__name__
-        if self._searcher is not None:
-            self._searcher.go_on_here()
+        if self.planner is not None:
+            self.planner.go_on_here()
         with environment_named(self.env):
             return super().learn(
                 total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
@@ -506,5 +506,5 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         return super().predict(observation, state, episode_start, deterministic)
 
     def _excluded_save_params(self) -> list[str]:
-        transient = ["_searcher", "_decision", "_checked_env", "_simulated_batches", "_noise_without_search"]
+        transient = ["planner", "_decision", "_checked_env", "_simulated_batches", "_noise_without_search"]
         return [*super()._excluded_save_params(), *transient]

@@ -29,10 +29,10 @@ from sb3_mcbs.networks.functions import (
 )
 from sb3_mcbs.networks.torch_settings import matmul_precision, one_thread
 from sb3_mcbs.search import (
-    Agent,
     Decision,
     EpisodeClock,
     LatencyForecast,
+    PolicyFunctions,
     RecentActions,
     SearchResult,
     SearchSettings,
@@ -47,7 +47,7 @@ from sb3_mcbs.types import Observations, difference, equal, n_rows, row_of, stac
 logger = logging.getLogger("sb3_mcbs")
 
 
-class Searcher(InOwnEnvironments):
+class Planner(InOwnEnvironments):
     """Searches for an agent from the present states of the environments that it acts in.
 
     :param agent: a TD3, DDPG, SAC or TQC agent.
@@ -131,7 +131,7 @@ class Searcher(InOwnEnvironments):
             plans = WarmStart(self._vec_env.num_envs, settings.horizon, self._act_dim)
         self.settings, self._plans = settings, plans
 
-    def go_on_after(self, before: "Searcher") -> None:
+    def go_on_after(self, before: "Planner") -> None:
         """Know what another one noticed about the same environments.
 
         :param before: what searched with other settings.
@@ -187,7 +187,7 @@ class Searcher(InOwnEnvironments):
         roots: list[Any] = []
         if self.model is not None:
             envs = self._all_envs if envs is None else envs
-            roots, observations = self._look(observations, envs)
+            roots, observations = self.capture_roots(observations, envs)
         elif envs is not None:
             observations = take_rows(observations, np.asarray(envs))
         agent, settings = self.agent_functions(), effort or self.settings
@@ -308,14 +308,14 @@ class Searcher(InOwnEnvironments):
             self.model.refresh()  # the environments' simulators have other values than when it was made
         self.model.deterministic = deterministic
 
-    def agent_functions(self) -> Agent:
+    def agent_functions(self) -> PolicyFunctions:
         """The agent as it is now, as a search knows it: functions of the environments' own observations."""
         policy, gamma = policy_function(self.agent), self.agent.gamma
         value, unscale = value_function(self.agent), unscale_function(self.agent)
         if self.model is None:
-            return Agent(policy, value, gamma, unscale, lambda rewards: rewards)
+            return PolicyFunctions(policy, value, gamma, unscale, lambda rewards: rewards)
         observe = self.view.observe
-        return Agent(
+        return PolicyFunctions(
             policy=lambda observations: policy(observe(observations)),
             value=lambda observations, actions: value(observe(observations), actions),
             gamma=gamma,
@@ -331,7 +331,9 @@ class Searcher(InOwnEnvironments):
         """
         return unscale_function(self.agent)(actions)
 
-    def _look(self, observations: Observations, envs: Sequence[int]) -> tuple[list[Any], Observations]:
+    def capture_roots(
+        self, observations: Observations, envs: Sequence[int]
+    ) -> tuple[list[Any], Observations]:
         """Where the rollouts start: roots, and the observations there as the forward model has them.
 
         :param observations: ``[n_envs, *]``, of all environments as the agent was given them.

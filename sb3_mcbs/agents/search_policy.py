@@ -13,7 +13,7 @@ from stable_baselines3.common.preprocessing import maybe_transpose
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_mcbs.agents.hyperparameters import REMOVED, SETTING_NAMES, refuse_removed, settings_of_preset
-from sb3_mcbs.agents.learned_search import make_searcher
+from sb3_mcbs.agents.learned_search import make_planner
 from sb3_mcbs.agents.mcbs import MCBS
 from sb3_mcbs.search import SearchResult, SearchSettings, with_preset
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
@@ -78,21 +78,21 @@ class SearchPolicy:
         self.last_result: SearchResult | None = None
         # A copy, so that acting elsewhere does not change the training.
         recent_actions = deepcopy(model.recent_actions) if isinstance(model, MCBS) else None
-        self.searcher = make_searcher(model, self.vec_env, self.settings, normalize_reward, recent_actions)
+        self.planner = make_planner(model, self.vec_env, self.settings, normalize_reward, recent_actions)
 
     def _follow_settings(self) -> None:
         """Search with the present settings from the next decision on."""
-        before = self.searcher
+        before = self.planner
         if before.follow(self.settings):
             return
-        make = partial(make_searcher, self.model, self.vec_env, self.settings)
-        self.searcher = make(before.normalize_reward, before.recent_actions)
-        self.searcher.go_on_after(before)
+        make = partial(make_planner, self.model, self.vec_env, self.settings)
+        self.planner = make(before.normalize_reward, before.recent_actions)
+        self.planner.go_on_after(before)
         before.close()
 
     def __setattr__(self, name: str, value: Any) -> None:
         attributes = vars(self)
-        if "searcher" not in attributes or (name in attributes and name not in _HELD):
+        if "planner" not in attributes or (name in attributes and name not in _HELD):
             super().__setattr__(name, value)
         elif name in ("model", "vec_env"):
             raise AttributeError(f"The {name} of a SearchPolicy cannot be exchanged: make another one.")
@@ -119,7 +119,7 @@ class SearchPolicy:
     def __copy__(self) -> "SearchPolicy":
         made = type(self).__new__(type(self))
         vars(made).update(vars(self))
-        vars(made)["searcher"] = copy(self.searcher)
+        vars(made)["planner"] = copy(self.planner)
         return made
 
     def _change_settings(self, settings: SearchSettings) -> None:
@@ -153,14 +153,14 @@ class SearchPolicy:
         """
         space = self.model.observation_space
         batched, is_single = _add_batch_axis(_channels_first(observation, space), space)
-        self.last_result = self.searcher.search(batched, self.rng)
-        self.searcher.note_actions(self.last_result.actions)
-        actions = self.searcher.unscale(self.last_result.actions)
+        self.last_result = self.planner.search(batched, self.rng)
+        self.planner.note_actions(self.last_result.actions)
+        actions = self.planner.unscale(self.last_result.actions)
         return (actions[0] if is_single else actions), state
 
     def close(self) -> None:
         """Release the forward model. The agent and the environment stay open."""
-        self.searcher.close()
+        self.planner.close()
 
     def __getattr__(self, name: str) -> Any:
         if name in ("model", "settings") or name.startswith("__"):

@@ -60,7 +60,7 @@ class SimulatedBatches:
             logger.info("The replay buffer's %s are dropped: no setting uses them.", ", ".join(gone))
 
     def connect(self) -> None:
-        """Follow the agent to another searcher.
+        """Follow the agent to another planner.
 
         :raises ForwardModelError: if its forward model is not one to learn from.
         """
@@ -109,9 +109,9 @@ class SimulatedBatches:
         if not agent.value_expansion:
             return None
         # Whoever loads a replay buffer or sets an environment exchanges them.
-        if self._expansion_of != (agent.replay_buffer, agent._searcher):
-            self._expansion = ValueExpansion(agent, agent._searcher)
-            self._expansion_of = (agent.replay_buffer, agent._searcher)
+        if self._expansion_of != (agent.replay_buffer, agent.planner):
+            self._expansion = ValueExpansion(agent, agent.planner)
+            self._expansion_of = (agent.replay_buffer, agent.planner)
         return self._expansion
 
 

@@ -18,7 +18,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_mcbs.agents.planner import Searcher
+from sb3_mcbs.agents.planner import Planner
 from sb3_mcbs.models import ForwardModelError
 from sb3_mcbs.networks.functions import policy_function, soft_policy_function, unscale_function
 from sb3_mcbs.networks.torch_settings import one_thread
@@ -108,12 +108,12 @@ class ValueExpansion:
     environment the state after the step, and whether there is one (not where the episode ended).
 
     :param agent: an :class:`~sb3_mcbs.MCBS` agent; what is simulated is added to its ``n_simulated_steps``.
-    :param searcher: of the agent, with its forward model.
+    :param planner: of the agent, with its forward model.
     :raises ForwardModelError: if the forward model's states are no arrays.
     """
 
-    def __init__(self, agent: Any, searcher: Searcher) -> None:
-        self._agent, self._searcher = agent, searcher
+    def __init__(self, agent: Any, planner: Planner) -> None:
+        self._agent, self.planner = agent, planner
         self._before: np.ndarray | None = None
         buffer = self._buffer = cast(Any, agent.replay_buffer)
         shape = (buffer.buffer_size, buffer.n_envs)
@@ -131,18 +131,18 @@ class ValueExpansion:
         return lambda observations, rng: (policy(observations), np.zeros(len(observations)))
 
     def _states(self, envs: range) -> np.ndarray:
-        searcher = self._searcher
-        states = searcher.read_roots(envs) if self._is_batched else []
+        planner = self.planner
+        states = planner.read_roots(envs) if self._is_batched else []
         if not self._is_batched:  # the environment may just have exchanged its simulator
             raise ForwardModelError(
                 "value_expansion keeps the simulator's states in the replay buffer, which needs batched "
-                f"MuJoCo; here simulates: {searcher.description}. Leave value_expansion out."
+                f"MuJoCo; here simulates: {planner.description}. Leave value_expansion out."
             )
         return np.stack(states)
 
     @property
     def _is_batched(self) -> bool:
-        return self._searcher.model is not None and self._searcher.model.kind == "mujoco"
+        return self.planner.model is not None and self.planner.model.kind == "mujoco"
 
     def look(self) -> None:
         """Remember the states that the environments are in before a step, for :meth:`model_error`."""
@@ -158,17 +158,17 @@ class ValueExpansion:
         """Compare what the simulator would have done with what the environments did, searched or not.
 
         :param actions: ``[n_envs, act_dim]``, executed, scaled.
-        :param observations: see :meth:`Searcher.model_error`, as all else.
+        :param observations: see :meth:`Planner.model_error`, as all else.
         :param rewards: ``[n_envs]``.
         :param infos: one per environment.
         :return: see there; ``None`` as well if the states before the step are not known.
         """
-        model, n_envs = self._searcher.model, self._buffer.n_envs
+        model, n_envs = self.planner.model, self._buffer.n_envs
         if self._before is None or model is None or not model.deterministic:
             return None
         with one_thread():
             model.set_roots(list(self._before), np.arange(n_envs), self._agent.rollout_rng)
-            step = model.step(self._searcher.unscale(actions))
+            step = model.step(self.planner.unscale(actions))
         self._agent.n_simulated_steps += n_envs
         self._before = None
         executed = SearchResult(
@@ -180,7 +180,7 @@ class ValueExpansion:
             simulated_steps=0,
             invalid_rollouts=0,
         )
-        return self._searcher.model_error(executed, range(n_envs), observations, rewards, infos)
+        return self.planner.model_error(executed, range(n_envs), observations, rewards, infos)
 
     def put(self, row: int, dones: np.ndarray) -> None:
         """Store the states that the environments are in after a step.
@@ -232,7 +232,7 @@ class ValueExpansion:
         :param outcome: of all transitions; changed.
         """
         returns, lengths, terminated, last = outcome
-        searcher, model, buffer = self._searcher, self._searcher.model, self._buffer
+        planner, model, buffer = self.planner, self.planner.model, self._buffer
         assert model is not None
         model.set_roots(list(states), np.arange(len(going)), rng)
         seen = buffer._normalize_obs(take_rows(last, going), env)
@@ -247,11 +247,11 @@ class ValueExpansion:
             returns[at] += gamma**number * rewards
             terminated[at] = step.terminated[valid]
             lengths[at] += 1
-            put_rows(last, at, searcher.view.observe(step.observations, normalize=False), valid)
+            put_rows(last, at, planner.view.observe(step.observations, normalize=False), valid)
             still = np.flatnonzero(step.goes_on)
             if not len(still):
                 return
-            seen = take_rows(searcher.view.observe(step.observations), still)
+            seen = take_rows(planner.view.observe(step.observations), still)
             if len(still) < len(going):
                 model.select(still)
                 going = going[still]

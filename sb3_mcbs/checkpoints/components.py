@@ -28,7 +28,7 @@ _PLACE = re.compile(r"(path|dir|directory|folder|file|filename|prefix)(_|$)")
 NOT_STATE: dict[type, dict[str, str]] = {
     BaseAlgorithm: {
         "start_time": "the time that was used so far is saved instead",
-        "_searcher": "its forward model simulates the environments as they are; what it noticed is saved",
+        "planner": "its forward model simulates the environments as they are; what it noticed is saved",
         "_decision": "of the last step; made anew before it is read",
         "_simulated_batches": "a view of the replay buffer",
         "_reasons_said": "what the user of this process was told",
@@ -39,7 +39,7 @@ NOT_STATE: dict[type, dict[str, str]] = {
         "tensorboard_log": "a setting, which was checked when the run was resumed",
     },
     SearchPolicy: {
-        "searcher": "its forward model simulates the environments as they are; what it noticed is saved",
+        "planner": "its forward model simulates the environments as they are; what it noticed is saved",
         "last_result": "of the last step; made anew before it is read",
     },
     nn.Module: {

@@ -146,7 +146,7 @@ class RunState:
                 raise CheckpointError(_refusal(name, part, error)) from error
         rest = {
             "seconds": (time.time_ns() - self._agent.start_time) / 1e9,
-            "searchers": {name: searcher.memory for name, searcher in self._searchers().items()},
+            "planners": {name: planner.memory for name, planner in self.planners().items()},
             "files": {name: self._written(part) for name, part in parts.items()},
             "generators": read_generators(),
         }
@@ -186,8 +186,8 @@ class RunState:
         for part in self._components.values():
             if isinstance(part, SearchAttributes | SearchPolicy):  # a callback may have changed its settings
                 part._follow_settings()
-        for name, searcher in self._searchers().items():
-            searcher.memory = rest["searchers"][name]
+        for name, planner in self.planners().items():
+            planner.memory = rest["planners"][name]
         open_log_files(agent.logger)
         for name, written in rest["files"].items():
             if written is not None:
@@ -195,12 +195,12 @@ class RunState:
         # Last, since whatever is made on the way may draw from them.
         set_generators(rest["generators"])
 
-    def _searchers(self) -> dict[str, Any]:
+    def planners(self) -> dict[str, Any]:
         found = {}
         for name, part in self._components.items():
-            searcher = vars(part).get("_searcher", vars(part).get("searcher"))
-            if searcher is not None and not isinstance(part, th.nn.Module):
-                found[name] = searcher
+            planner = vars(part).get("planner", vars(part).get("planner"))
+            if planner is not None and not isinstance(part, th.nn.Module):
+                found[name] = planner
         return found
 
     def _file(self, part: Any) -> Any:

@@ -3,7 +3,7 @@
 from sb3_mcbs.search.beam import beam_search
 from sb3_mcbs.search.deadline import LatencyForecast, deadline_search
 from sb3_mcbs.search.directions import RecentActions
-from sb3_mcbs.search.interface import Agent, FirstStep, SearchResult
+from sb3_mcbs.search.interface import FirstStep, PolicyFunctions, SearchResult
 from sb3_mcbs.search.proposals import Noise, draw_noise
 from sb3_mcbs.search.settings import PRESETS, SearchSettings, with_preset
 from sb3_mcbs.search.strategies import Decision, check_dynamics, search
@@ -11,12 +11,12 @@ from sb3_mcbs.search.warm_start import EpisodeClock, WarmStart
 
 __all__ = [
     "PRESETS",
-    "Agent",
     "Decision",
     "EpisodeClock",
     "FirstStep",
     "LatencyForecast",
     "Noise",
+    "PolicyFunctions",
     "RecentActions",
     "SearchResult",
     "SearchSettings",

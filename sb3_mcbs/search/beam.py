@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_mcbs.search.interface import Agent, FirstStep, SearchResult, stopped_values
+from sb3_mcbs.search.interface import FirstStep, PolicyFunctions, SearchResult, stopped_values
 from sb3_mcbs.search.proposals import (
     Noise,
     clip_actions,
@@ -39,7 +39,7 @@ def beam_search(
     model: ForwardModel | None,
     roots: Sequence[Any],
     observations: Observations,
-    agent: Agent,
+    functions: PolicyFunctions,
     settings: SearchSettings,
     noise: Noise,
     rng: np.random.Generator,
@@ -49,26 +49,26 @@ def beam_search(
     :param model: simulates the candidates; may be ``None`` if ``rollout_depth`` is 0.
     :param roots: present states of the environments, from :meth:`ForwardModel.read_roots`.
     :param observations: ``[n_envs, *obs_shape]``, present observations.
-    :param agent: networks, discount and scales.
+    :param functions: networks, discount and scales.
     :param settings: width, depth and simulations.
     :param noise: from :func:`draw_noise`.
     :param rng: given to a model with random dynamics, see :meth:`ForwardModel.set_roots`.
     :return: actions, and what the search found.
     """
-    policy_actions = agent.policy(observations)
+    policy_actions = functions.policy(observations)
     if settings.include_policy_action:
         noise = noise._replace(beam=without_first(noise.beam))
     candidates = propose(policy_actions, noise.beam, settings.include_policy_action)
     if settings.n_proposals is not None:
-        by_critics = critic_values(observations, candidates, agent)
+        by_critics = critic_values(observations, candidates, functions)
         kept = preselect(by_critics, settings.beam_width, always=int(settings.include_policy_action))
         candidates = np.take_along_axis(candidates, kept[..., None], axis=1)
         noise = noise._replace(beam=np.take_along_axis(noise.beam, kept[..., None], axis=1))
     if settings.rollout_depth == 0:
-        values = critic_values(observations, candidates, agent)[..., None]
+        values = critic_values(observations, candidates, functions)[..., None]
         return choose(policy_actions, candidates, values, None, 0)
     assert model is not None, "a rollout needs a forward model"
-    evaluated = rollout_values(model, roots, candidates, agent, settings, noise, rng)
+    evaluated = rollout_values(model, roots, candidates, functions, settings, noise, rng)
     return choose(policy_actions, candidates, *evaluated)
 
 
@@ -118,7 +118,7 @@ def rollout_values(
     model: ForwardModel,
     roots: Sequence[Any],
     candidates: np.ndarray,
-    agent: Agent,
+    functions: PolicyFunctions,
     settings: SearchSettings,
     noise: Noise,
     rng: np.random.Generator,
@@ -153,7 +153,7 @@ def rollout_values(
     for step_number in range(1, settings.horizon + 1):
         if out_of_time():
             raise OutOfTimeError(simulated_steps)
-        step = model.step(agent.unscale_action(actions))
+        step = model.step(functions.unscale_action(actions))
         observations = step.observations
         simulated_steps += len(actions)
         if step_number == 1:
@@ -161,16 +161,16 @@ def rollout_values(
             first_step = FirstStep(
                 take_rows(observations, every_candidate), step.rewards[every_candidate].copy()
             )
-        rewards = agent.scale_reward(step.rewards)
+        rewards = functions.scale_reward(step.rewards)
         all_valid = step.valid.all()
         if not all_valid:
             rewards = np.where(step.valid, rewards, np.nan)
         returns[unfinished] += discount * rewards
-        discount *= agent.gamma
+        discount *= functions.gamma
 
         rows: np.ndarray | None = None  # which of the model's rows go on, if not all as they are
         if step.stopped is not None:
-            stopped, values = stopped_values(step, agent)
+            stopped, values = stopped_values(step, functions)
             returns[np.arange(len(returns))[unfinished][stopped]] += discount * values
         if not all_valid or step.terminated.any() or step.stopped is not None:
             rows = np.flatnonzero(step.goes_on)
@@ -179,7 +179,7 @@ def rollout_values(
             unfinished = np.arange(len(returns))[unfinished][rows]
             observations = take_rows(observations, rows)
         # Simulations that are still one: the policy sees their observation once.
-        actions = agent.policy(observations)
+        actions = functions.policy(observations)
         is_last = step_number == settings.horizon
         if step_number == hold and shared > 1:
             returns, actions = np.repeat(returns, shared), np.repeat(actions, shared, axis=0)
@@ -191,7 +191,7 @@ def rollout_values(
         held = first_noise if step_number < hold else later_noise[step_number // hold - 1]
         actions = clip_actions(actions + held[unfinished])
         if is_last:
-            returns[unfinished] += discount * agent.value(observations, actions).astype(np.float64)
+            returns[unfinished] += discount * functions.value(observations, actions).astype(np.float64)
         elif rows is not None:
             model.select(rows)
     # Simulations that ended before they differed have the same value.

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from sb3_mcbs.search.beam import OutOfTimeError, choose, join_rounds, rollout_values
-from sb3_mcbs.search.interface import Agent, CountedValue, FirstStep, SearchResult
+from sb3_mcbs.search.interface import CountedValue, FirstStep, PolicyFunctions, SearchResult
 from sb3_mcbs.search.proposals import draw_noise, propose, without_first
 from sb3_mcbs.search.settings import SearchSettings
 from sb3_mcbs.types import ForwardModel, Observations
@@ -150,7 +150,7 @@ def deadline_search(
     model: ForwardModel,
     roots: Sequence[Any],
     observations: Observations,
-    agent: Agent,
+    functions: PolicyFunctions,
     settings: SearchSettings,
     deadline: float,
     pace: LatencyForecast,
@@ -165,7 +165,7 @@ def deadline_search(
     :param model: simulates the candidates.
     :param roots: present states of the environments.
     :param observations: ``[n_envs, *obs_shape]``, present observations.
-    :param agent: networks, discount and scales.
+    :param functions: networks, discount and scales.
     :param settings: depth, simulations, noise, and the number of candidates that is enough.
     :param deadline: when to be done, on the clock of ``pace``.
     :param pace: forecasts of this search, kept from decision to decision.
@@ -173,9 +173,9 @@ def deadline_search(
     :param directions: ``[proposal_dims, act_dim]``, in which candidates differ; ``None``: in all.
     :return: actions, and what the search found.
     """
-    policy_actions = agent.policy(observations)
-    value = CountedValue(agent.value)
-    agent = agent._replace(value=value)
+    policy_actions = functions.policy(observations)
+    value = CountedValue(functions.value)
+    functions = functions._replace(value=value)
     n_envs, act_dim = policy_actions.shape
     enough = settings.max_beam_width or settings.beam_width
     candidates: list[np.ndarray] = []
@@ -194,7 +194,7 @@ def deadline_search(
         proposed = propose(policy_actions, noise.beam, with_policy)
         try:
             round_values, first_step, steps = rollout_values(
-                model, roots, proposed, agent, settings, noise, rng, out_of_time=watch
+                model, roots, proposed, functions, settings, noise, rng, out_of_time=watch
             )
         except OutOfTimeError as reason:
             simulated_steps += reason.simulated_steps

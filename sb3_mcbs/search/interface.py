@@ -12,7 +12,7 @@ import numpy as np
 from sb3_mcbs.types import Observations, Transition, take_rows
 
 
-class Agent(NamedTuple):
+class PolicyFunctions(NamedTuple):
     """What a search has to know of the agent.
 
     :param policy: observations ``[rows, ...]`` -> actions ``[rows, act_dim]`` in [-1, 1], without
@@ -34,7 +34,7 @@ class Agent(NamedTuple):
 class CountedValue:
     """The critics, and how often they were asked.
 
-    :param value: see :class:`Agent`.
+    :param value: see :class:`PolicyFunctions`.
 
     :ivar evaluations: pairs of an observation and an action that were valued.
     """
@@ -90,11 +90,11 @@ class SearchResult(NamedTuple):
     surviving_roots: np.ndarray | None = None
 
 
-def stopped_values(step: Transition, agent: Agent) -> tuple[np.ndarray, np.ndarray]:
+def stopped_values(step: Transition, functions: PolicyFunctions) -> tuple[np.ndarray, np.ndarray]:
     """Value the rows of a step whose episode the environment itself truncated.
 
     :param step: ``[rows]``, with ``stopped``.
-    :param agent: its critics value what its policy would do there.
+    :param functions: its critics value what its policy would do there.
     :return: which rows ``[n]``, and their values ``[n]`` in float64.
     """
     assert step.stopped is not None
@@ -102,5 +102,5 @@ def stopped_values(step: Transition, agent: Agent) -> tuple[np.ndarray, np.ndarr
     if not len(rows):
         return rows, np.zeros(0)
     observations = take_rows(step.observations, rows)
-    actions = agent.policy(observations)
-    return rows, agent.value(observations, actions).astype(np.float64)
+    actions = functions.policy(observations)
+    return rows, functions.value(observations, actions).astype(np.float64)

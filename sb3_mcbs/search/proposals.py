@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_mcbs.search.directions import low_dimensional
-from sb3_mcbs.search.interface import Agent
+from sb3_mcbs.search.interface import PolicyFunctions
 from sb3_mcbs.search.settings import SearchSettings
 from sb3_mcbs.types import Observations, take_rows
 
@@ -138,17 +138,19 @@ def best(values: np.ndarray, keep: int) -> np.ndarray:
     return np.sort(np.argsort(-values, axis=1, kind="stable")[:, :keep], axis=1)
 
 
-def critic_values(observations: Observations, candidates: np.ndarray, agent: Agent) -> np.ndarray:
+def critic_values(
+    observations: Observations, candidates: np.ndarray, functions: PolicyFunctions
+) -> np.ndarray:
     """Rank candidates by the critics alone: the paper's first evaluation step.
 
     :param observations: ``[n, *obs_shape]``.
     :param candidates: ``[n, beam, act_dim]``.
-    :param agent: the critics.
+    :param functions: the critics.
     :return: ``[n, beam]`` in float64.
     """
     n, beam, act_dim = candidates.shape
     repeated = take_rows(observations, np.repeat(np.arange(n), beam))
-    values = agent.value(repeated, candidates.reshape(-1, act_dim))
+    values = functions.value(repeated, candidates.reshape(-1, act_dim))
     return values.reshape(n, beam).astype(np.float64)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from sb3_mcbs.search.beam import choose, join_rounds, mean_values, rollout_values
 from sb3_mcbs.search.directions import combine, gain
-from sb3_mcbs.search.interface import Agent, FirstStep, SearchResult
+from sb3_mcbs.search.interface import FirstStep, PolicyFunctions, SearchResult
 from sb3_mcbs.search.proposals import Noise, best, critic_values, draw_normal, preselect, propose, scale
 from sb3_mcbs.search.settings import SearchSettings
 from sb3_mcbs.types import ForwardModel, Observations
@@ -51,7 +51,7 @@ def refine_search(
     model: ForwardModel,
     roots: Sequence[Any],
     observations: Observations,
-    agent: Agent,
+    functions: PolicyFunctions,
     settings: SearchSettings,
     noise: np.ndarray,
     rng: np.random.Generator,
@@ -63,7 +63,7 @@ def refine_search(
     :param model: simulates the plans.
     :param roots: present states of the environments.
     :param observations: ``[n_envs, *obs_shape]``, present observations.
-    :param agent: networks, discount and scales.
+    :param functions: networks, discount and scales.
     :param settings: rounds, width, depth, elites and spreads.
     :param noise: from :func:`draw_plan_noise`.
     :param rng: given to a model with random dynamics.
@@ -72,7 +72,7 @@ def refine_search(
     :return: the actions and what the search found, and the plans that the actions are from,
         ``[n_envs, rollout_depth, act_dim]``; 0 where none was valid.
     """
-    policy_actions = agent.policy(observations)
+    policy_actions = functions.policy(observations)
     dims = remembered.shape[2] if directions is None else len(directions)
     beginning = first_spread(settings) * np.float32(gain(directions))
     source = Plans(remembered, np.broadcast_to(beginning, (*remembered.shape[:2], dims)))
@@ -91,11 +91,11 @@ def refine_search(
         always = _put_first(drawn, source.mean, settings.include_policy_action and number == 0)
         proposed = propose(policy_actions, drawn[:, :, 0], include_policy_action=False)
         if settings.n_proposals is not None:
-            kept = preselect(critic_values(observations, proposed, agent), settings.beam_width, always)
+            kept = preselect(critic_values(observations, proposed, functions), settings.beam_width, always)
             proposed = np.take_along_axis(proposed, kept[..., None], axis=1)
             drawn = np.take_along_axis(drawn, kept[..., None, None], axis=1)
         found, first_step, steps = rollout_values(
-            model, roots, proposed, agent, settings, _as_noise(drawn, settings.n_simulations), rng
+            model, roots, proposed, functions, settings, _as_noise(drawn, settings.n_simulations), rng
         )
         plans.append(drawn)
         candidates.append(proposed)

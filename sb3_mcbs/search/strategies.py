@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sb3_mcbs.search.beam import beam_search
-from sb3_mcbs.search.interface import Agent, CountedValue, SearchResult
+from sb3_mcbs.search.interface import CountedValue, PolicyFunctions, SearchResult
 from sb3_mcbs.search.proposals import draw_noise
 from sb3_mcbs.search.refine import draw_plan_noise, refine_search
 from sb3_mcbs.search.settings import SearchSettings
@@ -24,7 +24,7 @@ class Decision(NamedTuple):
     :param model: simulates; may be ``None`` if ``rollout_depth`` is 0.
     :param roots: present states of the environments, from :meth:`ForwardModel.read_roots`.
     :param observations: ``[n_envs, *obs_shape]``, present observations.
-    :param agent: networks, discount and scales.
+    :param functions: networks, discount and scales.
     :param settings: settings of the search.
     :param shape: ``(n_envs, act_dim)``.
     :param rng: of the search: draws all noise, and is given to a model with random dynamics.
@@ -37,7 +37,7 @@ class Decision(NamedTuple):
     model: ForwardModel | None
     roots: Sequence[Any]
     observations: Observations
-    agent: Agent
+    functions: PolicyFunctions
     settings: SearchSettings
     shape: tuple[int, int]
     rng: np.random.Generator
@@ -53,9 +53,9 @@ def search(decision: Decision) -> SearchResult:
     :param decision: what there is to decide.
     :return: actions, and what the search found.
     """
-    value = CountedValue(decision.agent.value)
+    value = CountedValue(decision.functions.value)
     strategy = STRATEGIES[decision.settings.strategy]
-    result = strategy(decision._replace(agent=decision.agent._replace(value=value)))
+    result = strategy(decision._replace(functions=decision.functions._replace(value=value)))
     return result._replace(critic_evaluations=value.evaluations)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from sb3_mcbs.search.beam import choose
 from sb3_mcbs.search.directions import low_dimensional
-from sb3_mcbs.search.interface import Agent, FirstStep, SearchResult, stopped_values
+from sb3_mcbs.search.interface import FirstStep, PolicyFunctions, SearchResult, stopped_values
 from sb3_mcbs.search.proposals import (
     best,
     clip_actions,
@@ -111,7 +111,7 @@ def tree_search(
     model: ForwardModel,
     roots: Sequence[Any],
     observations: Observations,
-    agent: Agent,
+    functions: PolicyFunctions,
     settings: SearchSettings,
     noise: TreeNoise,
     rng: np.random.Generator,
@@ -121,14 +121,14 @@ def tree_search(
     :param model: simulates the nodes.
     :param roots: present states of the environments.
     :param observations: ``[n_envs, *obs_shape]``, present observations.
-    :param agent: networks, discount and scales.
+    :param functions: networks, discount and scales.
     :param settings: width, branching, depth and simulations.
     :param noise: from :func:`draw_tree_noise`.
     :param rng: given to a model with random dynamics.
     :return: actions, and what the search found.
     """
     width, n_sim = settings.beam_width, settings.distinct_simulations(model.deterministic)
-    view = _View(observations, agent.policy(observations))
+    view = _View(observations, functions.policy(observations))
     policy_actions = view.policy_actions
     n_envs, n_roots = len(policy_actions), width * settings.branching
     nodes = _present(n_envs, n_sim)
@@ -139,14 +139,16 @@ def tree_search(
         drawn = noise.roots if depth == 0 else noise.later[depth - 1]
         if not (nodes.rows >= 0).any():
             break
-        actions, offsets = _children(nodes, view, drawn, children, agent, settings)
+        actions, offsets = _children(nodes, view, drawn, children, functions, settings)
         parents = np.repeat(nodes.rows, children, axis=2)
         parents = parents[parents >= 0]
         if depth == 0:
             model.set_roots(roots, parents, rng)
         else:
             model.select(parents)
-        growth = _grow(model, nodes, actions, offsets, children, depth * settings.noise_hold, agent, settings)
+        growth = _grow(
+            model, nodes, actions, offsets, children, depth * settings.noise_hold, functions, settings
+        )
         if depth == 0:
             candidates = actions.reshape(n_envs, n_sim, n_roots, -1)[:, 0]
             first_step = _first_simulation(growth, n_envs, n_sim)
@@ -182,7 +184,12 @@ def _numbered(nodes: _Nodes) -> _Nodes:
 
 
 def _children(
-    nodes: _Nodes, view: _View, drawn: np.ndarray, children: int, agent: Agent, settings: SearchSettings
+    nodes: _Nodes,
+    view: _View,
+    drawn: np.ndarray,
+    children: int,
+    functions: PolicyFunctions,
+    settings: SearchSettings,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Propose actions in every simulation that goes on.
 
@@ -198,7 +205,7 @@ def _children(
     actions = propose(view.policy_actions[rows], noise, settings.include_policy_action)
     if settings.n_proposals is not None:
         values = np.zeros((*goes_on.shape, drawn.shape[2]))
-        values[goes_on] = critic_values(take_rows(view.observations, rows), actions, agent)
+        values[goes_on] = critic_values(take_rows(view.observations, rows), actions, functions)
         # Every simulation of a node must take the same children, so that the critics' mean decides.
         of_nodes = values.sum(axis=1).reshape(-1, drawn.shape[2])
         kept = preselect(of_nodes, children, int(settings.include_policy_action))
@@ -215,7 +222,7 @@ def _grow(
     offsets: np.ndarray,
     children: int,
     steps_before: int,
-    agent: Agent,
+    functions: PolicyFunctions,
     settings: SearchSettings,
 ) -> _Growth:
     """Step the children, whose rows the forward model holds, for a macro-step, and value them.
@@ -228,17 +235,17 @@ def _grow(
     returns = np.repeat(nodes.returns, children, axis=2)
     totals, running, steps = returns[stepped], np.arange(len(actions)), 0
     for number in range(settings.noise_hold):
-        step = model.step(agent.unscale_action(actions))
+        step = model.step(functions.unscale_action(actions))
         steps += len(actions)
         if number == 0:
             first_step = FirstStep(take_rows(step.observations, slice(None)), step.rewards.copy())
-        rewards = np.where(step.valid, agent.scale_reward(step.rewards), np.nan)
-        totals[running] += agent.gamma ** (steps_before + number) * rewards
+        rewards = np.where(step.valid, functions.scale_reward(step.rewards), np.nan)
+        totals[running] += functions.gamma ** (steps_before + number) * rewards
         if step.stopped is not None:
-            stopped, values = stopped_values(step, agent)
-            totals[running[stopped]] += agent.gamma ** (steps_before + number + 1) * values
+            stopped, values = stopped_values(step, functions)
+            totals[running[stopped]] += functions.gamma ** (steps_before + number + 1) * values
         goes_on = step.goes_on
-        view = _look(step.observations, goes_on, agent, actions.shape[1])
+        view = _look(step.observations, goes_on, functions, actions.shape[1])
         stepping, running = running, running[goes_on]
         if not len(running):
             break
@@ -248,8 +255,8 @@ def _grow(
                 model.select(np.flatnonzero(goes_on))
     returns[stepped] = totals
     if len(running):
-        values = agent.value(take_rows(view.observations, goes_on), view.policy_actions[goes_on])
-        totals[running] += agent.gamma ** (steps_before + settings.noise_hold) * values.astype(np.float64)
+        values = functions.value(take_rows(view.observations, goes_on), view.policy_actions[goes_on])
+        totals[running] += functions.gamma ** (steps_before + settings.noise_hold) * values.astype(np.float64)
     with_values = returns.copy()
     with_values[stepped] = totals
     scores = with_values.mean(axis=1)
@@ -264,11 +271,11 @@ def _grow(
     return _Growth(grown, view, first_step, steps, int(np.count_nonzero(~np.isfinite(totals))))
 
 
-def _look(observations: Observations, goes_on: np.ndarray, agent: Agent, act_dim: int) -> _View:
+def _look(observations: Observations, goes_on: np.ndarray, functions: PolicyFunctions, act_dim: int) -> _View:
     """Observe rows of the forward model, and ask the policy where the simulation goes on."""
     policy_actions = np.zeros((len(goes_on), act_dim), dtype=np.float32)
     if goes_on.any():
-        policy_actions[goes_on] = agent.policy(take_rows(observations, goes_on))
+        policy_actions[goes_on] = functions.policy(take_rows(observations, goes_on))
     return _View(take_rows(observations, slice(None)), policy_actions)
 
 
