@@ -54,7 +54,7 @@ def over_decisions(agent: MCBSTD3, total: int, every: int) -> list[float]:
     for number in range(total + 1):
         if number % every == 0:
             seen.append(resident_mb())
-        result = agent.planner.search(observations, agent.search_rng)
+        result = agent.planner.plan(observations, agent.search_rng)
         observations, *_ = agent.env.step(agent.policy.unscale_action(result.actions))
     agent._last_obs = observations
     return seen

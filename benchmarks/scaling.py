@@ -51,7 +51,7 @@ def measure(env_id: str, name: str, seconds: float) -> list[dict[str, Any]]:
     rng = np.random.default_rng(0)
 
     def decide(agent: Any) -> Any:
-        return agent.planner.search(agent._last_obs, rng)
+        return agent.planner.plan(agent._last_obs, rng)
 
     calls = {str(value): timed(functools.partial(decide, agent)) for value, agent in agents.items()}
     times = alternate(calls, seconds, least=10)

@@ -78,7 +78,7 @@ class Decision:
     def search(self) -> SearchResult:
         """One decision from the present state, which stays as it is."""
         observations: Any = self.agent._last_obs
-        return self.planner.search(observations, self.rng)
+        return self.planner.plan(observations, self.rng)
 
     def search_the_usual_way(self) -> None:
         """The same by :mod:`naive`."""
@@ -90,7 +90,7 @@ class Decision:
         self.simulated_steps = self.search().simulated_steps
         if self.is_batched:  # its engine has its size now
             self._record_physics()
-        functions = self.planner.agent_functions()
+        functions = self.planner.functions()
         policy_rows, value_rows = [], []
 
         def noted_policy(observations: Any) -> np.ndarray:
@@ -102,9 +102,9 @@ class Decision:
             return functions.value(observations, actions)
 
         noted = functions._replace(policy=noted_policy, value=noted_value)
-        self.planner.agent_functions = lambda: noted  # type: ignore[method-assign]
+        self.planner.functions = lambda: noted  # type: ignore[method-assign]
         self.search()
-        del self.planner.agent_functions
+        del self.planner.functions
         critics: list[Any] = self.agent.critic.q_networks
         calls = [(self.agent.actor.mu, n) for n in policy_rows]
         calls += [(critic, n) for n in value_rows for critic in critics]

@@ -10,8 +10,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_mcbs import MCBSTD3
 from sb3_mcbs.networks.td3_update import FastUpdate, TD3Update
-from sb3_mcbs.search import search
-from sb3_mcbs.search.strategies import Decision
+from sb3_mcbs.search import Roots, search
 
 #: Lazy re-planning: so many states, once in so many updates of the critics.
 REPLANNED, REPLAN_EVERY = 20, 10
@@ -67,16 +66,16 @@ class PlanningTD3(MCBSTD3):
 
     def _sample_action(self, *args: Any, **kwargs: Any) -> tuple[np.ndarray, np.ndarray]:
         assert self.planner is not None
-        self._root = self.planner.read_roots([0])[0]
+        self._root = self.planner.read_states()[0]
         return super()._sample_action(*args, **kwargs)
 
     def _store_transition(self, replay_buffer: ReplayBuffer, *args: Any, **kwargs: Any) -> None:
         assert isinstance(replay_buffer, RowsReplayBuffer)
         row = replay_buffer.pos
         replay_buffer.roots[row] = self._root
-        replay_buffer.is_planned[row] = self._decision is not None
-        if self._decision is not None:
-            replay_buffer.plans[row] = self._decision[0].actions[0]
+        replay_buffer.is_planned[row] = self._prediction is not None
+        if self._prediction is not None:
+            replay_buffer.plans[row] = self._prediction.actions[0]
         super()._store_transition(replay_buffer, *args, **kwargs)
 
 
@@ -106,18 +105,8 @@ class PlanningUpdate(TD3Update):
         if not len(rows):
             return
         roots = [buffer.roots[row] for row in rows]
-        shape = (len(rows), buffer.action_dim)
-        observations = buffer.observations[rows, 0]
-        decision = Decision(
-            planner.model,
-            roots,
-            observations,
-            planner.agent_functions(),
-            planner.settings,
-            shape,
-            agent.search_rng,
-        )
-        result = search(decision)
+        start = Roots(planner.model, roots, buffer.observations[rows, 0])
+        result = search(start, planner.functions(), planner.settings, agent.search_rng)
         agent.n_simulated_steps += result.simulated_steps
         buffer.plans[rows] = result.actions
 

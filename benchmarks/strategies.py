@@ -58,7 +58,7 @@ def run_arm(agent: OffPolicyAlgorithm, env_id: str, seeds: range, settings: dict
     """
     env = make_vec_env(env_id, len(seeds), seed=seeds[0], wrapper_class=SnapshotEnvWrapper)
     policy = SearchPolicy(agent, env, seed=seeds[0], **{"n_threads": 1, **settings})
-    planner, functions = policy.planner, policy.planner.agent_functions()
+    planner, functions = policy.planner, policy.planner.functions()
     observations: Any = env.reset()
     running = list(range(len(seeds)))
     rewards: list[list[float]] = [[] for _ in seeds]
@@ -70,10 +70,10 @@ def run_arm(agent: OffPolicyAlgorithm, env_id: str, seeds: range, settings: dict
     while running:
         start, cpu_start = time.perf_counter(), time.process_time()
         if settings.get("rollout_depth") == 0:
-            result = planner.search(observations[running], policy.rng)
+            result = planner.plan(observations[running], policy.rng)
         else:
-            result = planner.search(observations, policy.rng, running)
-        planner.note_actions(result.actions)
+            result = planner.plan(observations, policy.rng, running)
+        planner.remember_actions(result.actions)
         seconds += time.perf_counter() - start
         cpu_seconds += time.process_time() - cpu_start
         simulated += result.simulated_steps

@@ -286,7 +286,7 @@ def test_rewards_are_scaled_as_the_critics_learn_them(make_agent):
     for normalize in (False, True):
         env.norm_reward = normalize
         agent.learn(2, reset_num_timesteps=False)
-        assert (agent.planner.view.scale_reward(rewards) == rewards).all() != normalize
+        assert (agent.planner.source.view.scale_reward(rewards) == rewards).all() != normalize
 
 
 def test_what_was_noticed_of_the_environment_is_not_forgotten(make_agent):

@@ -54,7 +54,7 @@ def test_a_copy_goes_on_as_the_original_does(make_agent, cls, make_copy):
     other = make_copy(original)
     assert other.env is not original.env and other.planner.agent is other
     assert_same_future(original, other)
-    assert other.planner.environments.wrappers[0] is other.env.envs[0] is not original.env.envs[0]
+    assert other.planner.source.environments.wrappers[0] is other.env.envs[0] is not original.env.envs[0]
 
 
 HANDLERS = {
@@ -89,7 +89,7 @@ def test_a_learned_model_goes_on(make_agent, make_copy):
     original = make_agent(**settings, ensemble_gradient_steps=20, ensemble_max_error=100.0).learn(150)
     other = make_copy(original)
     assert_same_future(original, other, 60)
-    assert other.planner._ensemble_model.ensemble is other.learned_model.ensemble
+    assert other.planner.model.ensemble is other.learned_model.ensemble
     assert other.learned_model.ensemble is not original.learned_model.ensemble
 
 
@@ -206,7 +206,8 @@ def test_a_copy_is_no_fork(make_agent, monkeypatch):
 
 def test_what_was_noticed_of_environments_stays_known(make_agent):
     original = make_agent("InvertedPendulum-v5").learn(25)
-    original.planner._go_on_with("pool", False)
+    memory = {**original.planner.memory, "kind": "pool", "deterministic": False}
+    original.planner.memory = memory
     other = copy.deepcopy(original)
     assert (other.planner.model.kind, other.planner.model.deterministic) == ("pool", False)
     third = copy.deepcopy(copy.deepcopy(original))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sb3_mcbs import MCBSTD3, SearchPolicy, SearchSettings
-from sb3_mcbs.search import LatencyForecast, PolicyFunctions, beam_search, deadline_search
+from sb3_mcbs.search import LatencyForecast, PolicyFunctions, Roots, beam_search, deadline_search
 from sb3_mcbs.search.beam import Noise
 from tests.conftest import snapshot_vec_env
 from tests.fake_model import LineWorld
@@ -38,6 +38,7 @@ AGENT = PolicyFunctions(
     gamma=0.9,
     unscale_action=lambda actions: actions,
     scale_reward=lambda rewards: rewards,
+    act_dim=1,
 )
 
 
@@ -52,7 +53,8 @@ def decide(world, pace, budget, seed=0, n_envs=1, **changes):
     observations = np.array(roots)[:, None]
     deadline = pace.clock() + budget
     rng = np.random.default_rng(seed)
-    return deadline_search(world, roots, observations, AGENT, settings(**changes), deadline, pace, rng)
+    start = Roots(world, roots, observations)
+    return deadline_search(start, AGENT, settings(**changes), deadline, pace, rng)
 
 
 def test_rounds_are_added_while_there_is_time():
@@ -78,9 +80,7 @@ def test_the_best_of_all_rounds_is_chosen_and_matches_one_beam():
     noise = Noise(result.candidates, np.zeros((1, 3, 8, 1, 1), dtype=np.float32))
     roots = list(np.linspace(1.0, 2.0, 3))
     one_beam = beam_search(
-        LineWorld(),
-        roots,
-        np.array(roots)[:, None],
+        Roots(LineWorld(), roots, np.array(roots)[:, None]),
         AGENT,
         SearchSettings(8, 1, 1),
         noise,
@@ -212,5 +212,5 @@ def test_searches_of_some_environments_do_not_spoil_the_forecasts_of_all():
     agent._setup_learn(1)
     planner = agent.planner
     for envs in ([0], [0, 1, 2], [2]):
-        planner.search(agent._last_obs, agent.search_rng, envs)
-    assert {n_envs for n_envs, _ in planner._paces} == {1, 3}
+        planner.plan(agent._last_obs, agent.search_rng, envs)
+    assert {n_envs for n_envs, _ in planner._forecasts} == {1, 3}

@@ -6,8 +6,8 @@ import pytest
 from sb3_mcbs import MCBSTD3, SearchPolicy, SearchSettings
 from sb3_mcbs.agents.planner import Planner
 from sb3_mcbs.search import (
-    Decision,
     RecentActions,
+    Roots,
     WarmStart,
     beam_search,
     deadline_search,
@@ -69,7 +69,7 @@ def test_a_beam_that_holds_noise_equals_the_reference(changes, world, determinis
     model.deterministic = deterministic
     rng = np.random.default_rng(0)
     noise = draw_noise(rng, settings, len(ROOTS), 1)
-    result = beam_search(model, ROOTS, OBSERVATIONS, AGENT, settings, noise, rng)
+    result = beam_search(Roots(model, ROOTS, OBSERVATIONS), AGENT, settings, noise, rng)
     distinct = settings.distinct_simulations(deterministic)
     steps = 0
     for env, root in enumerate(ROOTS):
@@ -91,7 +91,7 @@ def test_a_tree_that_holds_noise_equals_the_reference(changes, world):
     settings = SearchSettings(strategy="tree", **{"beam_noise": 0.5, **changes})
     model, rng = LineWorld(**world), np.random.default_rng(0)
     noise = draw_tree_noise(rng, settings, len(ROOTS), 1)
-    result = tree_search(model, ROOTS, OBSERVATIONS, AGENT, settings, noise, rng)
+    result = tree_search(Roots(model, ROOTS, OBSERVATIONS), AGENT, settings, noise, rng)
     steps = 0
     for env, root in enumerate(ROOTS):
         tree = tree_of(line_reference(model, root), settings)
@@ -109,7 +109,8 @@ def test_a_refinement_that_holds_noise_equals_the_reference(changes, world):
     model, rng = LineWorld(**world), np.random.default_rng(0)
     noise = draw_plan_noise(rng, settings, len(ROOTS), 1)
     remembered = rng.normal(scale=0.3, size=(len(ROOTS), settings.rollout_depth, 1)).astype(np.float32)
-    result, plans = refine_search(model, ROOTS, OBSERVATIONS, AGENT, settings, noise, rng, remembered)
+    result = refine_search(Roots(model, ROOTS, OBSERVATIONS), AGENT, settings, noise, rng, remembered)
+    plans = result.plans
     steps = 0
     for env, root in enumerate(ROOTS):
         refinement = refinement_of(line_reference(model, root), settings)
@@ -133,10 +134,8 @@ EVERY = [
 def test_simulated_steps_are_known_beforehand(changes, spread):
     settings = SearchSettings(**{"n_simulations": 2, "beam_noise": 0.4, **changes})
     model = LineWorld(spread=spread)
-    memory = WarmStart(len(ROOTS), settings.horizon, 1)
-    rng, envs = np.random.default_rng(0), range(len(ROOTS))
-    decision = Decision(model, ROOTS, OBSERVATIONS, AGENT, settings, (len(ROOTS), 1), rng)
-    result = search(decision._replace(memory=memory, envs=envs, clocks=[(1, 0)] * len(ROOTS)))
+    rng = np.random.default_rng(0)
+    result = search(Roots(model, ROOTS, OBSERVATIONS), AGENT, settings, rng)
     expected = len(ROOTS) * settings.simulated_steps(deterministic=spread == 0)
     assert result.simulated_steps == model.steps_taken == expected
 
@@ -148,8 +147,9 @@ def test_what_is_left_of_a_plan_is_the_mean_of_what_it_held():
     memory.keep(np.float32([[[0.1], [0.1], [0.4], [0.4]]]), [0], [(1, 0)])
     for moment, expected in (((1, 0), 0.1), ((1, 1), 0.25), ((1, 2), 0.4), ((1, 3), 0.2), ((2, 0), 0.0)):
         before = memory.state([moment])
-        decision = Decision(LineWorld(), [1.0], x, AGENT, settings, (1, 1), rng, memory, [0], [moment])
-        result = search(decision)
+        plans = memory.recall([0], [moment], settings.noise_hold)
+        result = search(Roots(LineWorld(), [1.0], x), AGENT, settings, rng, plans=plans)
+        memory.keep(result.plans, [0], [moment])
         mean = result.candidates[0, 0, 0] - AGENT.policy(x)[0, 0]
         assert mean == pytest.approx(expected, abs=1e-6)
         kept = memory.recall([0], [moment])[0, :, 0]
@@ -215,7 +215,8 @@ def test_real_environments(env_id, settings):
     planner = Planner(agent, vec_env, settings)
     observations = walk(vec_env, 5, rng)
     reference = reference_for(agent, vec_env.envs[0])
-    given = planner.model, planner.model.read_roots([0]), observations, planner.agent_functions(), settings
+    roots = Roots(planner.model, planner.model.read_roots([0]), observations)
+    given = roots, planner.functions(), settings
     if settings.strategy == "beam":
         noise = draw_noise(rng, settings, 1, act_dim, directions=directions)
         result = beam_search(*given, noise, rng)
@@ -228,11 +229,11 @@ def test_real_environments(env_id, settings):
     else:
         noise = draw_plan_noise(rng, settings, 1, act_dim)
         remembered = rng.normal(scale=0.2, size=(1, settings.rollout_depth, act_dim)).astype(np.float32)
-        result, plans = refine_search(*given, noise, rng, remembered, directions)
+        result = refine_search(*given, noise, rng, remembered, directions)
         outcome = refinement_of(reference, settings, directions).choose(
             observations[0], noise[:, 0], remembered[0]
         )
-        np.testing.assert_allclose(plans[0], outcome.plan, rtol=1e-4, atol=1e-6)
+        np.testing.assert_allclose(result.plans[0], outcome.plan, rtol=1e-4, atol=1e-6)
     assert_agree(result, 0, outcome)
     assert result.simulated_steps == outcome.steps
     planner.close()
@@ -264,7 +265,7 @@ def test_a_deadline_searches_in_the_directions_and_holds_noise():
     model, pace, rng = LineWorld(), LatencyForecast(), np.random.default_rng(0)
     deadline = pace.clock() + 10
     result = deadline_search(
-        model, ROOTS, OBSERVATIONS, AGENT, settings, deadline, pace, rng, np.float32([[0.0]])
+        Roots(model, ROOTS, OBSERVATIONS), AGENT, settings, deadline, pace, rng, np.float32([[0.0]])
     )
     assert result.simulated_steps == len(ROOTS) * settings.simulated_steps()
     np.testing.assert_array_equal(result.candidates[:, 1:], result.candidates[:, :1].repeat(3, axis=1))

@@ -11,7 +11,7 @@ from torch import nn
 from torch.nn.utils import prune
 
 from sb3_mcbs import MCBSDDPG, MCBSSAC, MCBSTD3, MCBSTQC, SearchPolicy
-from sb3_mcbs.agents.value_expansion import ValueExpansion
+from sb3_mcbs.agents.value_expansion import target_actor
 from tests.conftest import SEARCHING, WITHOUT_SEARCH, snapshot_vec_env
 
 
@@ -93,9 +93,9 @@ def test_a_search_is_around_the_present_actor(make_agent, cls, change):
         observations = vec_env.reset()
         rng = np.random.default_rng(0)
         before = scaled_action(agent, observations)
-        assert abs(planner.search(observations, rng).candidates - before).min() < 1e-6
+        assert abs(planner.plan(observations, rng).candidates - before).min() < 1e-6
         SEARCHED[change](agent)
-        result = planner.search(observations, rng)
+        result = planner.plan(observations, rng)
         found = abs(result.candidates - scaled_action(agent, observations)).min(axis=1)
         np.testing.assert_allclose(found, 0, atol=1e-6)
         assert abs(result.candidates - before).min() > 1e-6
@@ -119,9 +119,9 @@ def hook_of_a_critic(agent):
 def test_values_are_those_of_the_present_critics(make_agent, cls, change):
     agent = make_agent(cls=cls, rollout_depth=0, n_simulations=1)
     observations = agent.env.reset()
-    agent.planner.search(observations, np.random.default_rng(0))
+    agent.planner.plan(observations, np.random.default_rng(0))
     change(agent)
-    result = agent.planner.search(observations, np.random.default_rng(0))
+    result = agent.planner.plan(observations, np.random.default_rng(0))
     agent.policy.set_training_mode(False)
     seen = np.repeat(observations, result.candidates.shape[1], axis=0)
     with th.no_grad():
@@ -137,7 +137,7 @@ def test_actions_are_unscaled_by_the_present_policy(make_agent):
     policy.predict(observations)
     agent.policy.unscale_action = lambda actions: np.full_like(actions, 0.125)
     assert (policy.predict(observations)[0] == 0.125).all()
-    assert (policy.planner.agent_functions().unscale_action(np.ones((4, 1))) == 0.125).all()
+    assert (policy.planner.functions().unscale_action(np.ones((4, 1))) == 0.125).all()
     agent.policy = deepcopy(make_agent(cls=TD3).policy)
     assert (policy.predict(observations)[0] != 0.125).all()
 
@@ -146,12 +146,11 @@ def test_actions_are_unscaled_by_the_present_policy(make_agent):
 def test_expanded_targets_are_those_of_the_actor_that_is_trained(make_agent, cls):
     agent = make_agent("Hopper-v5", cls=cls, value_expansion=1)
     observations = np.random.default_rng(0).standard_normal((4, 11)).astype(np.float32)
-    expansion = ValueExpansion(agent, agent.planner)
-    before = expansion._acting()(observations, np.random.default_rng(0))[0]
+    before = target_actor(agent)(observations, np.random.default_rng(0))[0]
     th.manual_seed(3)
     name = "actor_target" if cls is MCBSTD3 else "actor"
     setattr(agent, name, agent.policy.make_actor())
-    after = expansion._acting()(observations, np.random.default_rng(0))[0]
+    after = target_actor(agent)(observations, np.random.default_rng(0))[0]
     assert abs(after - before).min() > 1e-6
     if cls is MCBSTD3:
         with th.no_grad():

@@ -7,7 +7,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from sb3_mcbs import SearchPolicy, SearchSettings, SnapshotEnvWrapper
-from sb3_mcbs.search import Decision, WarmStart, search
+from sb3_mcbs.search import Roots, WarmStart, search
 from tests.checkpoint_helpers import assert_resumed_is_exact
 from tests.conftest import snapshot_vec_env
 from tests.fake_model import LineWorld
@@ -73,9 +73,9 @@ def test_decisions_start_around_what_is_left_of_the_last_plan():
     memory, rng, x = WarmStart(1, 3, 1), np.random.default_rng(0), 1.0
     for moment in [(1, 0), (1, 1), (1, 2), (2, 0), (2, 2)]:
         expected = AGENT.policy(np.array([[x]])) + memory.recall([0], [moment])[:, 0]
-        result = search(
-            Decision(LineWorld(), [x], np.array([[x]]), AGENT, settings, (1, 1), rng, memory, [0], [moment])
-        )
+        roots, plans = Roots(LineWorld(), [x], np.array([[x]])), memory.recall([0], [moment])
+        result = search(roots, AGENT, settings, rng, plans=plans)
+        memory.keep(result.plans, [0], [moment])
         np.testing.assert_allclose(result.candidates[0, 0], np.clip(expected[0], -1, 1), rtol=1e-6)
         is_policy = result.candidates[0, 0] == AGENT.policy(np.array([[x]]))[0]
         assert is_policy == (moment in [(1, 0), (2, 0)])
@@ -87,7 +87,7 @@ REFINE = dict(strategy="refine", beam_width=4, rollout_depth=3, n_rounds=2, n_si
 
 def recalled(planner) -> np.ndarray:
     everywhere = planner._all_envs
-    return planner._plans.recall(everywhere, planner._episode_clocks(everywhere))
+    return planner._warm_start.recall(everywhere, planner._clocks(everywhere))
 
 
 @pytest.mark.parametrize("vec_env_cls", [DummyVecEnv, SubprocVecEnv])

@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_mcbs import MCBSDDPG, MCBSSAC, MCBSTD3, MCBSTQC, SearchSettings
 from sb3_mcbs.agents.planner import Planner
-from sb3_mcbs.search import beam_search, draw_noise
+from sb3_mcbs.search import Roots, beam_search, draw_noise
 from tests.conftest import SMALL
 from tests.reference_search import Reference
 
@@ -98,11 +98,9 @@ def assert_same_values_and_choice(cls, agent_settings, env_id, kwargs, kind, ste
     terminated_inside = False
     for trial in range(4):
         observations = walk(vec_env, steps + trial, rng)
-        roots = planner.model.read_roots([0])
+        roots = Roots(planner.model, planner.model.read_roots([0]), observations)
         noise = draw_noise(rng, settings, 1, vec_env.action_space.shape[0])
-        result = beam_search(
-            planner.model, roots, observations, planner.agent_functions(), settings, noise, rng
-        )
+        result = beam_search(roots, planner.functions(), settings, noise, rng)
         reference = reference_for(agent, vec_env.envs[0])
         chosen, values, rewards = reference.choose(observations[0], noise.beam[0], noise.rollout[:, 0])
         np.testing.assert_allclose(result.values[0], values, rtol=1e-5, atol=1e-5)
@@ -123,12 +121,13 @@ def test_rewards_are_exact():
     observations = walk(vec_env, 6, rng)
     # A policy that is the same constant in both makes the actions bit-identical, whatever the batch size.
     constant = np.zeros((1, vec_env.action_space.shape[0]), dtype=np.float32)
-    functions = planner.agent_functions()._replace(
+    functions = planner.functions()._replace(
         policy=lambda obs: np.repeat(constant, len(obs), axis=0),
         value=lambda obs, actions: np.zeros(len(actions)),
     )
-    roots, noise = planner.model.read_roots([0]), draw_noise(rng, settings, 1, constant.shape[1])
-    result = beam_search(planner.model, roots, observations, functions, settings, noise, rng)
+    roots = Roots(planner.model, planner.model.read_roots([0]), observations)
+    noise = draw_noise(rng, settings, 1, constant.shape[1])
+    result = beam_search(roots, functions, settings, noise, rng)
     reference = reference_for(agent, vec_env.envs[0])
     reference.policy, reference.critics = lambda obs: constant[0], lambda obs, action: [0.0]
     chosen, values, _ = reference.choose(observations[0], noise.beam[0], noise.rollout[:, 0])
@@ -147,8 +146,9 @@ def test_normalised_observations_and_rewards():
     walk(vec_env, 9, rng)
     statistics = vec_env.obs_rms.mean.copy(), vec_env.ret_rms.var, vec_env.returns.copy()
     observations = vec_env.get_original_obs()
-    roots, noise = planner.model.read_roots([0]), draw_noise(rng, settings, 1, 3)
-    result = beam_search(planner.model, roots, observations, planner.agent_functions(), settings, noise, rng)
+    roots = Roots(planner.model, planner.model.read_roots([0]), observations)
+    noise = draw_noise(rng, settings, 1, 3)
+    result = beam_search(roots, planner.functions(), settings, noise, rng)
 
     reference = reference_for(agent, vec_env.venv.envs[0])
     plain_step = reference.env_step

@@ -207,8 +207,8 @@ def test_searched_action_is_executed_and_stored_as_it_is(make_agent, cls):
     agent = make_agent(env, cls=cls, action_noise=NormalActionNoise(np.zeros(1), 5.0 * np.ones(1)))
     chosen = []
     agent._setup_learn(1)
-    search = agent.planner.search
-    agent.planner.search = lambda *args: chosen.append(search(*args)) or chosen[-1]
+    plan = agent.planner.plan
+    agent.planner.plan = lambda *args: chosen.append(plan(*args)) or chosen[-1]
     agent.learn(40)
     assert len(chosen) == 20
     searched = np.concatenate([result.actions for result in chosen])

@@ -85,4 +85,4 @@ def test_file_holds_no_model_of_the_environment(make_agent, tmp_path):
     agent = make_agent("HalfCheetah-v5", buffer_size=100).learn(30)
     agent.save(tmp_path / "agent")
     data = MCBSTD3.load(tmp_path / "agent", device="cpu").__dict__
-    assert data["planner"] is None and data["_decision"] is None
+    assert data["planner"] is None and data["_prediction"] is None

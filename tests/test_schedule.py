@@ -232,7 +232,7 @@ def test_streams_do_not_depend_on_the_schedule(make_agent, cls):
         )
         agent.learn(24)  # the first step after 20 random ones
         first_unsearched[share] = agent.replay_buffer.actions[5]
-        searched = [] if agent._decision is None else list(agent._decision[1])
+        searched = [] if agent._prediction is None else list(agent._prediction.envs)
     kept = [env for env in range(4) if env not in searched]
     assert searched and kept, "some of each"
     same = first_unsearched[0.0] == first_unsearched[0.5]
@@ -265,7 +265,7 @@ def test_only_searched_rows_are_read_and_simulated(make_agent, monkeypatch, env_
 
     def search(envs):
         monkeypatch.setattr("sb3_mcbs.search.strategies.draw_noise", lambda *args, **kwargs: noise.of(envs))
-        return planner.search(agent._last_obs, rng, envs)
+        return planner.plan(agent._last_obs, rng, envs)
 
     some = search([1, 3])
     assert read == [[1, 3]] and some.actions.shape[0] == 2
@@ -287,8 +287,8 @@ def test_searched_rows_are_executed_as_they_were_simulated(make_agent):
     )
     errors = []
     agent._setup_learn(1)
-    model_error = agent.planner.model_error
-    agent.planner.model_error = lambda *args: errors.append(model_error(*args)) or errors[-1]
+    verify = agent.planner.verify
+    agent.planner.verify = lambda *step: errors.append(verify(*step)) or errors[-1]
     agent.learn(150)
     assert len(errors) > 20 and set(errors) == {0.0}
     assert 30 < agent.n_decisions < 110

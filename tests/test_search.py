@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sb3_mcbs.search import Noise, PolicyFunctions, SearchSettings, beam_search, draw_noise
+from sb3_mcbs.search import Noise, PolicyFunctions, Roots, SearchSettings, beam_search, draw_noise
 from tests.fake_model import LineWorld
 from tests.reference_search import Reference
 
@@ -23,13 +23,18 @@ def value(observations, actions):
 
 
 AGENT = PolicyFunctions(
-    policy, value, GAMMA, unscale_action=lambda action: action, scale_reward=lambda reward: reward
+    policy,
+    value,
+    GAMMA,
+    unscale_action=lambda action: action,
+    scale_reward=lambda reward: reward,
+    act_dim=1,
 )
 
 
 def search(model, roots, settings, noise, agent=AGENT):
     observations = np.asarray(roots, dtype=float)[:, None]
-    return beam_search(model, roots, observations, agent, settings, noise, np.random.default_rng(3))
+    return beam_search(Roots(model, roots, observations), agent, settings, noise, np.random.default_rng(3))
 
 
 def reference_values(model, root, noise, env):
@@ -126,7 +131,7 @@ def test_critic_that_is_not_finite_is_never_followed(bad):
     agent = AGENT._replace(value=lambda obs, actions: np.where(actions[:, 0] > 0, bad, value(obs, actions)))
     settings = SearchSettings(32, 0, 1, beam_noise=0.5)
     noise = draw_noise(np.random.default_rng(0), settings, 1, 1)
-    result = beam_search(None, [], np.array([[0.0]]), agent, settings, noise, np.random.default_rng(0))
+    result = beam_search(Roots(None, [], np.array([[0.0]])), agent, settings, noise, np.random.default_rng(0))
     assert result.actions[0, 0] <= 0 < result.candidates.max()
     assert np.isfinite(result.values[0, result.chosen[0]])
 
@@ -135,7 +140,7 @@ def test_depth_zero_ranks_by_the_critics():
     settings = SearchSettings(16, 0, 5, beam_noise=0.5)
     noise = draw_noise(np.random.default_rng(0), settings, 2, 1)
     observations = np.array([[0.7], [-0.2]])
-    result = beam_search(None, [], observations, AGENT, settings, noise, np.random.default_rng(0))
+    result = beam_search(Roots(None, [], observations), AGENT, settings, noise, np.random.default_rng(0))
     for env in range(2):
         expected = [min(critics(observations[env], action)) for action in result.candidates[env]]
         np.testing.assert_allclose(result.values[env], expected, rtol=1e-6)

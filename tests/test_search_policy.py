@@ -291,8 +291,8 @@ class TestRewardScale:
         agent = make_agent(training).learn(40)
         sync_envs_normalization(training, evaluation)
         policy = SearchPolicy(agent, evaluation)
-        assert policy.planner.view.reward_normalizer is training
-        scaled = policy.planner.view.scale_reward(np.array([1.0]))
+        assert policy.planner.source.view.reward_normalizer is training
+        scaled = policy.planner.source.view.scale_reward(np.array([1.0]))
         assert scaled[0] == pytest.approx(1 / np.sqrt(training.ret_rms.var + training.epsilon))
         assert training.norm_reward and not evaluation.norm_reward
 
@@ -304,15 +304,18 @@ class TestRewardScale:
         alone = MCBSTD3.load(tmp_path / "agent", device="cpu")
         with pytest.warns(UserWarning, match="normalize_reward=True or False"):
             policy = SearchPolicy(alone, evaluation)
-        assert policy.planner.view.reward_normalizer is evaluation
-        assert SearchPolicy(alone, evaluation, normalize_reward=False).planner.view.reward_normalizer is None
+        assert policy.planner.source.view.reward_normalizer is evaluation
+        assert (
+            SearchPolicy(alone, evaluation, normalize_reward=False).planner.source.view.reward_normalizer
+            is None
+        )
 
     def test_raw_rewards_stay_raw(self, make_agent):
         env = VecNormalize(make_vec_env("Hopper-v5", 1, seed=0), norm_reward=False)
         agent = make_agent(env).learn(40)
-        assert agent.planner.view.reward_normalizer is None
+        assert agent.planner.source.view.reward_normalizer is None
         agent.set_env(env)
-        assert agent.planner.view.reward_normalizer is None
+        assert agent.planner.source.view.reward_normalizer is None
 
 
 def test_search_draws_nothing_from_global_generators(make_agent):

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from stable_baselines3.common.noise import NormalActionNoise
 
 from sb3_mcbs import MCBSTD3, MCBSTQC, SearchPolicy, SearchSettings, SnapshotEnvWrapper
-from sb3_mcbs.search import Decision, LatencyForecast, PolicyFunctions, WarmStart, deadline_search, search
+from sb3_mcbs.search import LatencyForecast, PolicyFunctions, Roots, deadline_search, search
 from tests.conftest import SMALL, snapshot_vec_env
 from tests.fake_model import LineWorld
 
@@ -116,16 +116,15 @@ def test_settings_are_refused_or_search_a_small_world(kwargs: dict[str, Any]) ->
         gamma=0.9,
         unscale_action=lambda actions: actions,
         scale_reward=lambda rewards: rewards,
+        act_dim=1,
     )
-    rng, roots, observations = np.random.default_rng(0), [0.5, -1.0], np.array([[0.5], [-1.0]])
+    rng, roots = np.random.default_rng(0), Roots(LineWorld(), [0.5, -1.0], np.array([[0.5], [-1.0]]))
     if found.time_budget is None:
-        memory = WarmStart(2, found.horizon, 1)
-        decision = Decision(LineWorld(), roots, observations, agent, found, (2, 1), rng)
-        result = search(decision._replace(memory=memory, envs=[0, 1], clocks=[(0, 0), (0, 0)]))
+        result = search(roots, agent, found, rng)
     else:
         pace = LatencyForecast()
         deadline = pace.clock() + min(found.time_budget, 0.01)
-        result = deadline_search(LineWorld(), roots, observations, agent, found, deadline, pace, rng)
+        result = deadline_search(roots, agent, found, deadline, pace, rng)
     assert result.actions.shape == (2, 1)
     assert (np.abs(result.actions) <= 1).all()
 

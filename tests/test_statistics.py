@@ -79,7 +79,7 @@ def test_agent_with_statistics(make_agent, normalizer, tmp_path):
         policy = SearchPolicy(model, env, seed=0, **SMALL_SEARCH)
         env.seed(5)  # SB3's loader has seeded the environment
         actions.append(policy.predict(env.reset())[0])
-        assert policy.planner.view.reward_normalizer is env
+        assert policy.planner.source.view.reward_normalizer is env
     np.testing.assert_array_equal(*actions)
 
 

@@ -7,7 +7,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_mcbs import MCBSTD3, SearchPolicy, SearchSettings
 from sb3_mcbs.agents.planner import Planner
-from sb3_mcbs.search import Decision, WarmStart, check_dynamics, search
+from sb3_mcbs.agents.roots import EnvironmentStep, Prediction
+from sb3_mcbs.search import Roots, check_dynamics, search
 from sb3_mcbs.search.refine import draw_plan_noise, first_spread, refine_search
 from sb3_mcbs.search.tree import draw_tree_noise, tree_search
 from tests.conftest import SMALL, snapshot_vec_env
@@ -41,11 +42,8 @@ def line_reference(model: LineWorld, root: float) -> Reference:
 def on_line(model, settings, seed=0, roots=ROOTS, rng=None):
     """Search from points of a line through the one interface."""
     observations = np.asarray(roots, dtype=float)[:, None]
-    memory, clocks = WarmStart(len(roots), settings.rollout_depth, 1), [(1, 0)] * len(roots)
     rng = rng or np.random.default_rng(seed)
-    shape = (len(roots), 1)
-    envs = range(len(roots))
-    return search(Decision(model, roots, observations, AGENT, settings, shape, rng, memory, envs, clocks))
+    return search(Roots(model, roots, observations), AGENT, settings, rng)
 
 
 def tree_of(reference: Reference, settings: SearchSettings) -> ReferenceTree:
@@ -147,7 +145,8 @@ def test_refinement_equals_the_reference(changes, world, warm):
     if warm:
         remembered[1:] = rng.normal(scale=0.3, size=remembered[1:].shape)
     observations = np.array(ROOTS)[:, None]
-    result, plans = refine_search(model, ROOTS, observations, AGENT, settings, noise, rng, remembered)
+    result = refine_search(Roots(model, ROOTS, observations), AGENT, settings, noise, rng, remembered)
+    plans = result.plans
     steps = 0
     for env, root in enumerate(ROOTS):
         reference = refinement_of(line_reference(model, root), settings)
@@ -184,7 +183,7 @@ def test_real_environments(env_id, kwargs, kind, steps):
     for trial in range(3):
         observations = walk(vec_env, steps + trial, rng)
         reference = reference_for(agent, vec_env.envs[0])
-        given = planner.model, planner.model.read_roots([0]), observations, planner.agent_functions()
+        given = Roots(planner.model, planner.model.read_roots([0]), observations), planner.functions()
 
         noise = draw_tree_noise(rng, tree, 1, act_dim)
         result = tree_search(*given, tree, noise, rng)
@@ -195,10 +194,10 @@ def test_real_environments(env_id, kwargs, kind, steps):
 
         noise = draw_plan_noise(rng, refine, 1, act_dim)
         remembered = rng.normal(scale=0.2, size=(1, 3, act_dim)).astype(np.float32)
-        result, plans = refine_search(*given, refine, noise, rng, remembered)
+        result = refine_search(*given, refine, noise, rng, remembered)
         outcome = refinement_of(reference, refine).choose(observations[0], noise[:, 0], remembered[0])
         assert_agree(result, 0, outcome)
-        np.testing.assert_allclose(plans[0], outcome.plan, rtol=1e-4, atol=1e-6)
+        np.testing.assert_allclose(result.plans[0], outcome.plan, rtol=1e-4, atol=1e-6)
         assert result.simulated_steps == outcome.steps
     assert fewer_steps == (env_id in ("InvertedPendulum-v5", "Hopper-v5"))
 
@@ -346,6 +345,9 @@ def test_dynamics_that_turn_out_to_be_random_end_a_search_of_single_simulations(
     policy = SearchPolicy(agent, env, strategy="tree", rollout_depth=2, n_simulations=1)
     actions, _ = policy.predict(env.reset())
     observations, rewards, _, infos = env.step(actions)
+    happened = EnvironmentStep(observations + 1, rewards, infos)
+    error = policy.planner.verify(Prediction([0], actions, policy.last_result.first_step), happened)
+    assert error == 1
     with pytest.warns(UserWarning, match="random"), pytest.raises(ValueError, match="luckiest"):
-        policy.planner.model_error(policy.last_result, [0], observations + 1, rewards, infos)
+        policy.planner.resync(error)
     policy.close()

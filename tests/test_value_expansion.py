@@ -8,7 +8,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 
 from sb3_mcbs import MCBSDDPG, MCBSSAC, MCBSTD3, MCBSTQC
-from sb3_mcbs.agents.value_expansion import ValueExpansion
+from sb3_mcbs.agents.value_expansion import ExpandedReplayBuffer
 from sb3_mcbs.models import ForwardModelError
 from sb3_mcbs.networks.functions import policy_function, soft_policy_function
 from tests.conftest import snapshot_vec_env
@@ -98,9 +98,8 @@ def test_samples_are_those_of_a_plain_loop(make_agent, env_id, cls, normalized):
     buffer, env = agent.replay_buffer, snapshot_vec_env(env_id).envs[0]
     env.reset(seed=0)
     rows, envs = (index.ravel() for index in np.meshgrid(np.arange(buffer.size()), np.arange(2)))
-    expansion = ValueExpansion(agent, agent.planner)
     before = agent.n_simulated_steps
-    sample = expansion.sample(len(rows), GAMMA, FixedRows(rows, envs), agent.get_vec_normalize_env())
+    sample = buffer.sample_expanded(len(rows), FixedRows(rows, envs), agent.get_vec_normalize_env())
     simulated, n_terminated, n_ended = 0, 0, 0
     for index, (row, number) in enumerate(zip(rows, envs, strict=True)):
         reward, last = buffer.rewards[row, number], buffer.next_observations[row, number]
@@ -126,10 +125,10 @@ def test_samples_are_those_of_a_plain_loop(make_agent, env_id, cls, normalized):
 @pytest.mark.parametrize("cls", AGENTS)
 def test_agents_learn_from_both_parts(make_agent, cls, monkeypatch):
     sizes = []
-    sample = ValueExpansion.sample
+    sample = ExpandedReplayBuffer.sample_expanded
     monkeypatch.setattr(
-        ValueExpansion,
-        "sample",
+        ExpandedReplayBuffer,
+        "sample_expanded",
         lambda self, n, *args: sizes.append(n) or sample(self, n, *args),
     )
     agent, _ = trained(make_agent, n_envs=1, cls=cls, batch_size=32, expanded_share=0.25)
@@ -197,7 +196,7 @@ def test_an_edited_simulator_is_followed_without_any_search(make_agent):
     with pytest.warns(UserWarning, match="edited"):
         agent.learn(10, reset_num_timesteps=False)
     env, model = agent.get_env().envs[0], agent.planner.model
-    model.set_roots(agent.planner.read_roots([0]), np.zeros(1, int), np.random.default_rng(0))
+    model.set_roots(agent.planner.read_states(), np.zeros(1, int), np.random.default_rng(0))
     action = np.array([[2.0]], dtype=np.float32)
     np.testing.assert_array_equal(model.step(action).observations[0], env.step(action[0])[0])
 
@@ -209,9 +208,8 @@ def test_every_executed_action_is_as_it_is_simulated(make_agent, cls, dtype):
     noise = NormalActionNoise(np.zeros(3), 0.3 * np.ones(3), dtype=dtype)
     vec_env = VecNormalize(snapshot_vec_env("Hopper-v5", 2))
     agent = make_agent(vec_env, cls=cls, value_expansion=1, search_share=0.5, action_noise=noise)
-    batches = agent._simulated_batches
-    model_error = batches.model_error
-    batches.model_error = lambda *step: errors.append(model_error(*step)) or errors[-1]
+    verify = agent.planner.verify
+    agent.planner.verify = lambda *step: errors.append(verify(*step)) or errors[-1]
     agent.learn(200)
     assert errors == [0.0] * 100, "warm-up, searched and not searched, the last step of an episode"
     assert agent.replay_buffer.dones.any()

@@ -37,13 +37,19 @@ from sb3_mcbs.agents.learned_model import (
     check_learned_model,
     set_up_learned_model,
 )
-from sb3_mcbs.agents.learned_search import make_planner
 from sb3_mcbs.agents.planner import Planner
+from sb3_mcbs.agents.roots import EnvironmentStep, Prediction
 from sb3_mcbs.agents.schedule import ScheduleSettings, SearchSchedule
-from sb3_mcbs.agents.simulated_batches import SimulatedBatches
+from sb3_mcbs.agents.value_expansion import (
+    ValueExpansionSettings,
+    batched_states,
+    drop_states,
+    expand,
+)
 from sb3_mcbs.networks.torch_settings import matmul_precision
-from sb3_mcbs.search import RecentActions, SearchResult, SearchSettings
+from sb3_mcbs.search import FirstStep, RecentActions, SearchResult, SearchSettings
 from sb3_mcbs.search.random_streams import spawn_rng
+from sb3_mcbs.types import take_rows
 
 SelfMCBS = TypeVar("SelfMCBS", bound="MCBS")
 
@@ -100,10 +106,11 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         self.n_critic_evaluations = 0
         self.n_diverged_steps = 0
         self.planner: Planner | None = None
-        #: What was executed, and the environments that were searched.
-        self._decision: tuple[SearchResult, Sequence[int]] | None = None
+        #: What the search predicted for the actions that are executed next.
+        self._prediction: Prediction | None = None
+        #: The states that they are executed in, where value expansion reads them.
+        self._states: np.ndarray | None = None
         self.rollout_rng: np.random.Generator | None = None
-        self._simulated_batches: SimulatedBatches | None = None
         self.learned_model: LearnedModel | None = None
         self._checked_env: VecCheckFinite | None = None
         self._noise_without_search: ActionNoise | None = None
@@ -132,7 +139,8 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
             self._schedule = SearchSchedule(schedule, self.seed)
         self._schedule.settings = schedule
         self._remember_actions(settings)
-        self._simulated_batches = SimulatedBatches(self)
+        self._check_expansion()
+        self._keeps_states = self.value_expansion > 0
         set_up_learned_model(self)
         if self.env is not None:
             self._make_planner(self.env, settings)
@@ -144,19 +152,36 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
     def _follow_settings(self) -> None:
         settings, schedule = self._checked_settings()
         check_learned_model(self)
-        if self._simulated_batches is not None and self.replay_buffer is not None:
-            self._simulated_batches.check_settings()
-        before = self.planner
-        if before is not None and not before.follow(settings):
-            assert self.env is not None
-            self._make_planner(self.env, settings)
-            assert self.planner is not None
-            self.planner.go_on_after(before)
+        self._check_expansion()
+        if (self.value_expansion > 0) != self._keeps_states:
+            raise ValueError(
+                "value_expansion keeps states beside the replay buffer: it can be changed later, but not "
+                "from or to 0; save the agent, and load it with the other settings."
+            )
+        if self.planner is not None and self.planner.follow(settings):
+            self._check_states()
+            self._say_what_simulates()
         self._remember_actions(settings)
         assert self._schedule is not None
         self._schedule.settings = schedule
         if self.env is not None:
             self._explore_where_not_searched()
+
+    def _check_expansion(self) -> None:
+        expansion = ValueExpansionSettings.of(self)
+        expansion.check_search(self.search_settings)
+        assert self.replay_buffer is not None
+        expansion.check_buffer(self.replay_buffer.optimize_memory_usage)
+
+    def _check_states(self) -> None:
+        if self.value_expansion:
+            batched_states(self)  # refuses other forward models
+
+    def _expand_buffer(self) -> None:
+        """Whoever loads a replay buffer or sets an environment exchanges what value expansion needs."""
+        if self.value_expansion:
+            assert self.replay_buffer is not None
+            expand(self.replay_buffer, self)
 
     def _remember_actions(self, settings: SearchSettings) -> None:
         if self.recent_actions is None and settings.proposal_dims is not None:
@@ -167,16 +192,19 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
             )
 
     def _make_planner(self, env: VecEnv, settings: SearchSettings) -> None:
-        before, self._decision = self.planner, None
+        before, self._prediction, self._states = self.planner, None, None
         # What this environment's VecNormalize does is what the critics learn from.
         normalizer = unwrap_vec_normalize(env)
         normalize_reward = normalizer is not None and normalizer.norm_reward
-        self.planner = make_planner(self, env, settings, normalize_reward, self.recent_actions)
-        if self._simulated_batches is not None:
-            self._simulated_batches.connect()
+        self.planner = Planner(self, env, settings, normalize_reward, self.recent_actions)
+        self._check_states()
+        self._expand_buffer()
         if before is not None:
             before.close()
-        if self.verbose >= 1:
+        self._say_what_simulates()
+
+    def _say_what_simulates(self) -> None:
+        if self.verbose >= 1 and self.planner is not None:
             print(f"Forward model: {self.planner.description}")
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
@@ -198,8 +226,6 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
             vars(made)[name] = copy(vars(self)[name])
         if made.planner is not None:
             made.planner.agent = made
-        if made._simulated_batches is not None:
-            made._simulated_batches = SimulatedBatches(made)
         return made
 
     def set_random_seed(self, seed: int | None = None) -> None:
@@ -231,9 +257,8 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         :return: actions ``[n_envs, *act_shape]`` to take in the environment
             and scaled actions that will be stored in the replay buffer.
         """
-        assert self._simulated_batches is not None
-        self._simulated_batches.look()
-        self._decision = None
+        self._prediction = None
+        self._states = batched_states(self) if self.value_expansion else None
         self._check_noise_after_search()
         if self._noise_without_search is None:  # action_noise may have been taken away
             self._explore_where_not_searched()
@@ -262,8 +287,8 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         if self.action_noise_after_search and noise is not None:
             drawn = np.broadcast_to(noise.last, scaled_actions.shape)[searched]
             found = np.clip(found + drawn, -1, 1).astype(found.dtype)
-        else:
-            self._decision = result, searched
+        elif result.first_step is not None:
+            self._prediction = _prediction_of(result, searched)
         if executed.all():
             return self.policy.unscale_action(found), found
         # Of one kind, so that actions reach the environments as they are simulated.
@@ -280,7 +305,7 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         if self._vec_normalize_env is not None:
             self.planner.normalize_rewards(self._vec_normalize_env.norm_reward)
         start = time.perf_counter()
-        result = self.planner.search(self._last_obs, self.search_rng, envs, effort)
+        result = self.planner.plan(self._last_obs, self.search_rng, envs, effort)
         self._record_decision(result, time.perf_counter() - start, effort)
         return result
 
@@ -310,15 +335,23 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
             leave_out_step(self, replay_buffer, new_obs)
             return
         if self.num_timesteps - self.n_envs >= self.learning_starts:  # random actions have no directions
-            self.planner.note_actions(buffer_action)
-        assert self._simulated_batches is not None
-        error = self._simulated_batches.model_error(buffer_action, new_obs, raw_reward, infos)
-        if error is None and self._decision is not None:
-            error = self.planner.model_error(*self._decision, new_obs, raw_reward, infos)
+            self.planner.remember_actions(buffer_action)
+        self._verify(buffer_action, EnvironmentStep(new_obs, raw_reward, infos))
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+
+    def _verify(self, actions: np.ndarray, happened: EnvironmentStep) -> None:
+        """Compare what the forward model says of a step with what happened, and follow the environments."""
+        planner, prediction = self.planner, self._prediction
+        assert planner is not None and self.rollout_rng is not None
+        if self._states is not None:  # of every step, searched or not
+            prediction = planner.predict(list(self._states), actions, self.rollout_rng)
+            self.n_simulated_steps += 0 if prediction is None else len(actions)
+            self._states = None
+        error = None if prediction is None else planner.verify(prediction, happened)
         if error is not None:
             self.logger.record_mean("search/model_error", error)
-        self._simulated_batches.store(replay_buffer.pos, dones)
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+            if error > 0:
+                planner.resync(error)
 
     def _note_step(self, reward: np.ndarray, dones: np.ndarray) -> np.ndarray:
         """Tell the schedule of a step, and return its rewards as the environments gave them."""
@@ -332,6 +365,7 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
     def collect_rollouts(self, env: VecEnv, *args: Any, **kwargs: Any) -> RolloutReturn:
         if self._checked_env is None or self._checked_env.venv is not env:
             self._checked_env = VecCheckFinite(env)
+        self._expand_buffer()
         self._leave_out_unstored()  # of a training that goes on in another agent, if a callback copied it
         try:
             return super().collect_rollouts(self._checked_env, *args, **kwargs)
@@ -361,8 +395,8 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         if self.learned_model is not None:
             assert self.replay_buffer is not None
             self.learned_model.check_room(self.replay_buffer)
-        assert self._simulated_batches is not None
-        self._simulated_batches.begin()
+        if not self.value_expansion:
+            drop_states(self.replay_buffer)
         will_reset = reset_num_timesteps or self._last_obs is None
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args, **kwargs)
         if self._total_timesteps:  # what is known of progress is that of the training before
@@ -396,8 +430,8 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         """
         if self.learned_model is not None:
             self.learned_model.fit_if_due(self, EnsembleSettings.of(self))
-        assert self._simulated_batches is not None
-        with matmul_precision(self.matmul_precision), self._simulated_batches.mixed():
+        self._expand_buffer()
+        with matmul_precision(self.matmul_precision):
             super().train(gradient_steps, batch_size)
 
     def _record_decision(self, result: SearchResult, seconds: float, effort: SearchSettings) -> None:
@@ -506,5 +540,17 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         return super().predict(observation, state, episode_start, deterministic)
 
     def _excluded_save_params(self) -> list[str]:
-        transient = ["planner", "_decision", "_checked_env", "_simulated_batches", "_noise_without_search"]
+        transient = ["planner", "_prediction", "_states", "_checked_env", "_noise_without_search"]
         return [*super()._excluded_save_params(), *transient]
+
+
+def _prediction_of(result: SearchResult, envs: Sequence[int]) -> Prediction:
+    """What a search predicts for the actions that it chose.
+
+    :param result: of the search.
+    :param envs: the environments that were searched.
+    """
+    assert result.first_step is not None
+    rows = np.flatnonzero(result.chosen >= 0)
+    step = FirstStep(take_rows(result.first_step.observations, rows), result.first_step.rewards[rows])
+    return Prediction([envs[row] for row in rows.tolist()], result.actions[rows], step)

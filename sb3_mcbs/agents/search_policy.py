@@ -3,7 +3,6 @@
 import operator
 from copy import copy, deepcopy
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -13,8 +12,8 @@ from stable_baselines3.common.preprocessing import maybe_transpose
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_mcbs.agents.hyperparameters import REMOVED, SETTING_NAMES, refuse_removed, settings_of_preset
-from sb3_mcbs.agents.learned_search import make_planner
 from sb3_mcbs.agents.mcbs import MCBS
+from sb3_mcbs.agents.planner import Planner
 from sb3_mcbs.search import SearchResult, SearchSettings, with_preset
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 
@@ -78,17 +77,7 @@ class SearchPolicy:
         self.last_result: SearchResult | None = None
         # A copy, so that acting elsewhere does not change the training.
         recent_actions = deepcopy(model.recent_actions) if isinstance(model, MCBS) else None
-        self.planner = make_planner(model, self.vec_env, self.settings, normalize_reward, recent_actions)
-
-    def _follow_settings(self) -> None:
-        """Search with the present settings from the next decision on."""
-        before = self.planner
-        if before.follow(self.settings):
-            return
-        make = partial(make_planner, self.model, self.vec_env, self.settings)
-        self.planner = make(before.normalize_reward, before.recent_actions)
-        self.planner.go_on_after(before)
-        before.close()
+        self.planner = Planner(model, self.vec_env, self.settings, normalize_reward, recent_actions)
 
     def __setattr__(self, name: str, value: Any) -> None:
         attributes = vars(self)
@@ -125,13 +114,8 @@ class SearchPolicy:
     def _change_settings(self, settings: SearchSettings) -> None:
         if not isinstance(settings, SearchSettings):
             raise TypeError(f"Expected SearchSettings, got {settings!r}.")
-        before, vars(self)["settings"] = self.settings, settings
-        try:
-            self._follow_settings()
-        except Exception:
-            vars(self)["settings"] = before
-            self._follow_settings()
-            raise
+        self.planner.follow(settings)
+        vars(self)["settings"] = settings
 
     def predict(
         self,
@@ -153,8 +137,8 @@ class SearchPolicy:
         """
         space = self.model.observation_space
         batched, is_single = _add_batch_axis(_channels_first(observation, space), space)
-        self.last_result = self.planner.search(batched, self.rng)
-        self.planner.note_actions(self.last_result.actions)
+        self.last_result = self.planner.plan(batched, self.rng)
+        self.planner.remember_actions(self.last_result.actions)
         actions = self.planner.unscale(self.last_result.actions)
         return (actions[0] if is_single else actions), state
 

@@ -1,4 +1,4 @@
-"""Targets of the critics from a few exact steps of the present actor: model-based value expansion.
+"""Critic targets that are rolled forward in the simulator: model-based value expansion.
 
 After a stored transition the simulator goes on, from the state that it was really in, with the actions that
 the present target actor takes (of SAC and TQC: drawn from the present actor, whose entropy counts at every
@@ -7,25 +7,29 @@ some steps later: rewards are exact, actions are not old ones as in the returns 
 travel several steps in one update.
 """
 
-from collections.abc import Callable
+import functools
+import logging
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
-from typing import Any, NamedTuple, cast
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
+import torch as th
 from sb3_contrib import TQC
 from stable_baselines3 import SAC
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_mcbs.agents.planner import Planner
 from sb3_mcbs.models import ForwardModelError
-from sb3_mcbs.networks.functions import policy_function, soft_policy_function, unscale_function
+from sb3_mcbs.networks.functions import policy_function, soft_policy_function
 from sb3_mcbs.networks.torch_settings import one_thread
-from sb3_mcbs.search import SearchResult, SearchSettings
+from sb3_mcbs.search import SearchSettings
 from sb3_mcbs.search.checks import CheckedSettings
-from sb3_mcbs.search.interface import FirstStep
 from sb3_mcbs.types import Observations, map_arrays, put_rows, take_rows
+
+logger = logging.getLogger("sb3_mcbs")
 
 Samples = ReplayBufferSamples | DictReplayBufferSamples
 
@@ -38,7 +42,7 @@ class ValueExpansionSettings(CheckedSettings):
     """Whether the critics' targets look further than one step.
 
     :param value_expansion: steps that are simulated after a sampled transition, with the present target
-        actor, before the critics' target closes it. 0: none, as SB3.
+        actor, before the target bootstraps from the critics. 0: none, as SB3.
     :param expanded_share: the share of every batch whose transitions are expanded. Every gradient step
         simulates ``value_expansion`` environment steps for each of them.
     :raises TypeError: if a value has the wrong type.
@@ -86,7 +90,209 @@ class ValueExpansionSettings(CheckedSettings):
             )
 
 
-class _Outcome(NamedTuple):
+#: What is kept beside a replay buffer's rows; a saved buffer has it under these names.
+ARRAYS = ("expansion_states", "expansion_held")
+
+
+class ExpandedReplayBuffer(ReplayBuffer):
+    """A replay buffer that keeps the simulator's states, and rolls a part of what it samples forward.
+
+    For every row and environment it keeps the state after the step, and whether there is one (not where the
+    episode ended). It is made of a replay buffer of any class by :func:`expand`, and pickled as one of that
+    class, so that whoever loads it needs nothing of this package.
+
+    :ivar agent: the :class:`~sb3_mcbs.MCBS` agent that learns from it; what is simulated is added to its
+        ``n_simulated_steps``.
+    :ivar expansion_states: ``[buffer_size, n_envs, state_size]``.
+    :ivar expansion_held: ``[buffer_size, n_envs]`` bool.
+    """
+
+    #: The class that it would be without expansion.
+    base_class: ClassVar[type[ReplayBuffer]]
+    not_checkpointed = ("agent",)
+
+    agent: Any
+    expansion_states: np.ndarray
+    expansion_held: np.ndarray
+
+    def add(
+        self,
+        obs: Any,
+        next_obs: Any,
+        action: np.ndarray,
+        reward: np.ndarray,
+        done: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """Store a step, and the states that the environments are in after it.
+
+        :param done: ``[n_envs]``, whether the episode ended: the environment is in another one then.
+        """
+        self.expansion_states[self.pos] = batched_states(self.agent)
+        self.expansion_held[self.pos] = ~done.astype(bool)
+        super().add(obs, next_obs, action, reward, done, infos)
+
+    def sample(self, batch_size: int, env: VecNormalize | None = None) -> Any:
+        """Draw transitions, of which ``expanded_share`` are expanded.
+
+        :param batch_size: how many.
+        :param env: normalises observations and rewards.
+        :return: as of a buffer of transitions over several steps. Those that ended an episode are as they
+            were.
+        """
+        agent = self.agent
+        n_expanded = round(agent.expanded_share * batch_size)
+        samples = []
+        if n_expanded < batch_size:
+            own: Any = super().sample(batch_size - n_expanded, env=env)
+            if own.discounts is None:
+                own = own._replace(discounts=th.full_like(own.rewards, agent.gamma))
+            samples.append(own)
+        if n_expanded:
+            samples.append(self.sample_expanded(n_expanded, agent.rollout_rng, env))
+        return type(samples[0])(*(_joined(fields) for fields in zip(*samples, strict=True)))
+
+    def sample_expanded(self, n: int, rng: np.random.Generator, env: VecNormalize | None) -> Samples:
+        """Draw transitions, and go on from them.
+
+        :param n: how many.
+        :param rng: draws them.
+        :param env: normalises observations and rewards.
+        """
+        at = rng.integers(0, self.size(), n), rng.integers(0, self.n_envs, n)
+        path = _Path(
+            np.array(self._normalize_reward(self.rewards[at], env), dtype=np.float64),
+            np.ones(n, dtype=int),
+            (self.dones[at] * (1 - self.timeouts[at])).astype(bool),
+            map_arrays(itemgetter(at), self.next_observations),
+        )
+        going = np.flatnonzero(self.expansion_held[at])
+        if len(going):
+            states = self.expansion_states[at[0][going], at[1][going]]
+            with one_thread():
+                self._roll_forward(states, going, path, rng, env)
+        return self._as_samples(at, path, env)
+
+    def _roll_forward(
+        self,
+        states: np.ndarray,
+        going: np.ndarray,
+        path: "_Path",
+        rng: np.random.Generator,
+        env: VecNormalize | None,
+    ) -> None:
+        """Simulate the target actor from some states.
+
+        :param states: ``[m, state_size]``.
+        :param going: ``[m]``, whose states these are.
+        :param path: of all transitions; changed.
+        """
+        returns, lengths, terminated, last = path
+        agent, planner = self.agent, self.agent.planner
+        model, view = planner.model, planner.source.view
+        model.set_roots(list(states), np.arange(len(going)), rng)
+        seen: Any = self._normalize_obs(take_rows(last, going), env)
+        act = target_actor(agent)
+        for number in range(1, agent.value_expansion + 1):
+            actions, bonus = act(seen, rng)
+            step = model.step(planner.unscale(actions))
+            agent.n_simulated_steps += len(going)
+            valid = np.flatnonzero(step.valid)  # a simulation that diverged ends one step earlier
+            at = going[valid]
+            rewards = self._normalize_reward(step.rewards[valid], env) + bonus[valid]
+            returns[at] += agent.gamma**number * rewards
+            terminated[at] = step.terminated[valid]
+            lengths[at] += 1
+            put_rows(last, at, view.observe(step.observations, normalize=False), valid)
+            still = np.flatnonzero(step.goes_on)
+            if not len(still):
+                return
+            seen = take_rows(view.observe(step.observations), still)
+            if len(still) < len(going):
+                model.select(still)
+                going = going[still]
+
+    def _as_samples(self, at: tuple[np.ndarray, ...], path: "_Path", env: VecNormalize | None) -> Samples:
+        """Make a batch, with discounts for the next observations' values.
+
+        :param at: rows and environments ``[n]`` where the transitions begin.
+        """
+        first: Any = self._normalize_obs(map_arrays(itemgetter(at), self.observations), env)
+        last: Any = self._normalize_obs(path.observations, env)
+        samples = DictReplayBufferSamples if isinstance(first, dict) else ReplayBufferSamples
+        return samples(
+            map_arrays(self.to_torch, first),
+            self.to_torch(self.actions[at]),
+            map_arrays(self.to_torch, last),
+            self.to_torch(path.terminated.astype(np.float32)[:, None]),
+            self.to_torch(path.returns.astype(np.float32)[:, None]),
+            self.to_torch((self.agent.gamma**path.lengths).astype(np.float32)[:, None]),
+        )
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        held: Any = self.__getstate__()
+        state = {name: value for name, value in held.items() if name != "agent"}
+        return object.__new__, (self.base_class,), state
+
+
+def expand(buffer: ReplayBuffer, agent: Any) -> None:
+    """Have a replay buffer expand what it samples.
+
+    The buffer itself becomes an :class:`ExpandedReplayBuffer`: whoever holds it goes on adding to its rows.
+
+    :param buffer: a replay buffer of any class.
+    :param agent: see :class:`ExpandedReplayBuffer`.
+    :raises ForwardModelError: if the forward model's states are no arrays.
+    """
+    if not isinstance(buffer, ExpandedReplayBuffer):
+        shape = (buffer.buffer_size, buffer.n_envs, batched_states(agent).shape[1])
+        held: Any = buffer
+        if getattr(held, "expansion_states", np.zeros(0)).shape != shape:
+            held.expansion_states = np.zeros(shape)
+            held.expansion_held = np.zeros(shape[:2], dtype=bool)
+        held.__class__ = _expanded_class(type(buffer))
+    vars(buffer)["agent"] = agent
+
+
+@functools.cache
+def _expanded_class(base: type[ReplayBuffer]) -> type[ExpandedReplayBuffer]:
+    return type(f"Expanded{base.__name__}", (ExpandedReplayBuffer, base), {"base_class": base})
+
+
+def drop_states(buffer: ReplayBuffer | None) -> None:
+    """Let go of states that an earlier training kept beside a replay buffer, and this one does not use.
+
+    :param buffer: the replay buffer.
+    """
+    kept = [name for name in ARRAYS if name in vars(buffer)]
+    for name in kept:
+        delattr(buffer, name)
+    if kept:
+        logger.info("The replay buffer's %s are dropped: no setting uses them.", ", ".join(kept))
+
+
+def batched_states(agent: Any) -> np.ndarray:
+    """Read the present states of an agent's environments.
+
+    :param agent: an :class:`~sb3_mcbs.MCBS` agent.
+    :return: ``[n_envs, state_size]``.
+    :raises ForwardModelError: if the forward model's states are no arrays.
+    """
+    planner = agent.planner
+    states = planner.read_states() if _is_batched(planner.model) else []
+    if not _is_batched(planner.model):  # the environment may just have exchanged its simulator
+        raise ForwardModelError(
+            "value_expansion keeps the simulator's states in the replay buffer, which needs batched "
+            f"MuJoCo; here simulates: {planner.description}. Leave value_expansion out."
+        )
+    return np.stack(states)
+
+
+def _is_batched(model: Any) -> bool:
+    return model is not None and model.kind == "mujoco"
+
+
+class _Path(NamedTuple):
     """What transitions of several steps came to.
 
     :param returns: ``[n]``, discounted sums of rewards as the networks are given them.
@@ -101,188 +307,17 @@ class _Outcome(NamedTuple):
     observations: Observations
 
 
-class ValueExpansion:
-    """The simulator's states beside the rows of a replay buffer, and what follows from them.
-
-    States are attributes of the buffer, so that they are saved and loaded with it: for every row and
-    environment the state after the step, and whether there is one (not where the episode ended).
-
-    :param agent: an :class:`~sb3_mcbs.MCBS` agent; what is simulated is added to its ``n_simulated_steps``.
-    :param planner: of the agent, with its forward model.
-    :raises ForwardModelError: if the forward model's states are no arrays.
-    """
-
-    def __init__(self, agent: Any, planner: Planner) -> None:
-        self._agent, self.planner = agent, planner
-        self._before: np.ndarray | None = None
-        buffer = self._buffer = cast(Any, agent.replay_buffer)
-        shape = (buffer.buffer_size, buffer.n_envs)
-        held = getattr(buffer, "expansion_states", None)
-        (state,) = self._states(range(1))
-        if held is None or held.shape[:2] != shape:
-            buffer.expansion_states = np.zeros((*shape, len(state)))
-            buffer.expansion_held = np.zeros(shape, dtype=bool)
-
-    def _acting(self) -> Callable[[Observations, np.random.Generator], tuple[np.ndarray, np.ndarray]]:
-        """The actor of the targets as it is now: its actions, and what their entropy adds."""
-        if isinstance(self._agent, SAC | TQC):
-            return soft_policy_function(self._agent)
-        policy = policy_function(self._agent, target=True)
-        return lambda observations, rng: (policy(observations), np.zeros(len(observations)))
-
-    def _states(self, envs: range) -> np.ndarray:
-        planner = self.planner
-        states = planner.read_roots(envs) if self._is_batched else []
-        if not self._is_batched:  # the environment may just have exchanged its simulator
-            raise ForwardModelError(
-                "value_expansion keeps the simulator's states in the replay buffer, which needs batched "
-                f"MuJoCo; here simulates: {planner.description}. Leave value_expansion out."
-            )
-        return np.stack(states)
-
-    @property
-    def _is_batched(self) -> bool:
-        return self.planner.model is not None and self.planner.model.kind == "mujoco"
-
-    def look(self) -> None:
-        """Remember the states that the environments are in before a step, for :meth:`model_error`."""
-        self._before = self._states(range(self._buffer.n_envs))
-
-    def model_error(
-        self,
-        actions: np.ndarray,
-        observations: Observations,
-        rewards: np.ndarray,
-        infos: list[dict[str, Any]],
-    ) -> float | None:
-        """Compare what the simulator would have done with what the environments did, searched or not.
-
-        :param actions: ``[n_envs, act_dim]``, executed, scaled.
-        :param observations: see :meth:`Planner.model_error`, as all else.
-        :param rewards: ``[n_envs]``.
-        :param infos: one per environment.
-        :return: see there; ``None`` as well if the states before the step are not known.
-        """
-        model, n_envs = self.planner.model, self._buffer.n_envs
-        if self._before is None or model is None or not model.deterministic:
-            return None
-        with one_thread():
-            model.set_roots(list(self._before), np.arange(n_envs), self._agent.rollout_rng)
-            step = model.step(self.planner.unscale(actions))
-        self._agent.n_simulated_steps += n_envs
-        self._before = None
-        executed = SearchResult(
-            actions=actions,
-            chosen=np.where(step.valid, 0, -1),
-            candidates=actions[:, None],
-            values=np.zeros((n_envs, 1)),
-            first_step=FirstStep(step.observations, step.rewards),
-            simulated_steps=0,
-            invalid_rollouts=0,
-        )
-        return self.planner.model_error(executed, range(n_envs), observations, rewards, infos)
-
-    def put(self, row: int, dones: np.ndarray) -> None:
-        """Store the states that the environments are in after a step.
-
-        :param row: of the replay buffer that the step will be in.
-        :param dones: ``[n_envs]``, whether the episode ended: the environment is in another one then.
-        """
-        self._buffer.expansion_states[row] = self._states(range(self._buffer.n_envs))
-        self._buffer.expansion_held[row] = ~dones.astype(bool)
-
-    def sample(self, n: int, gamma: float, rng: np.random.Generator, env: VecNormalize | None) -> Samples:
-        """Draw transitions, and go on from them.
-
-        :param n: how many.
-        :param gamma: discount factor per step.
-        :param rng: draws them.
-        :param env: normalises observations and rewards.
-        :return: as of a buffer of transitions over several steps. Those that ended an episode are as they
-            were.
-        """
-        buffer = self._buffer
-        at = rng.integers(0, buffer.size(), n), rng.integers(0, buffer.n_envs, n)
-        outcome = _Outcome(
-            np.array(buffer._normalize_reward(buffer.rewards[at], env), dtype=np.float64),
-            np.ones(n, dtype=int),
-            (buffer.dones[at] * (1 - buffer.timeouts[at])).astype(bool),
-            map_arrays(itemgetter(at), buffer.next_observations),
-        )
-        going = np.flatnonzero(buffer.expansion_held[at])
-        if len(going):
-            states = buffer.expansion_states[at[0][going], at[1][going]]
-            with one_thread():
-                self._go_on(states, going, outcome, gamma, rng, env)
-        return _as_samples(buffer, at, buffer.actions[at], outcome, gamma, env)
-
-    def _go_on(
-        self,
-        states: np.ndarray,
-        going: np.ndarray,
-        outcome: _Outcome,
-        gamma: float,
-        rng: np.random.Generator,
-        env: VecNormalize | None,
-    ) -> None:
-        """Simulate the target actor from some states.
-
-        :param states: ``[m, state_size]``.
-        :param going: ``[m]``, whose states these are.
-        :param outcome: of all transitions; changed.
-        """
-        returns, lengths, terminated, last = outcome
-        planner, model, buffer = self.planner, self.planner.model, self._buffer
-        assert model is not None
-        model.set_roots(list(states), np.arange(len(going)), rng)
-        seen = buffer._normalize_obs(take_rows(last, going), env)
-        act, unscale = self._acting(), unscale_function(self._agent)
-        for number in range(1, self._agent.value_expansion + 1):
-            actions, bonus = act(seen, rng)
-            step = model.step(unscale(actions))
-            self._agent.n_simulated_steps += len(going)
-            valid = np.flatnonzero(step.valid)  # a simulation that diverged ends one step earlier
-            at = going[valid]
-            rewards = buffer._normalize_reward(step.rewards[valid], env) + bonus[valid]
-            returns[at] += gamma**number * rewards
-            terminated[at] = step.terminated[valid]
-            lengths[at] += 1
-            put_rows(last, at, planner.view.observe(step.observations, normalize=False), valid)
-            still = np.flatnonzero(step.goes_on)
-            if not len(still):
-                return
-            seen = take_rows(planner.view.observe(step.observations), still)
-            if len(still) < len(going):
-                model.select(still)
-                going = going[still]
+def target_actor(
+    agent: Any,
+) -> Callable[[Observations, np.random.Generator], tuple[np.ndarray, np.ndarray]]:
+    """The actor of the targets as it is now: its actions, and what their entropy adds."""
+    if isinstance(agent, SAC | TQC):
+        return soft_policy_function(agent)
+    policy = policy_function(agent, target=True)
+    return lambda observations, rng: (policy(observations), np.zeros(len(observations)))
 
 
-def _as_samples(
-    buffer: Any,
-    at: tuple[np.ndarray, ...],
-    actions: np.ndarray,
-    outcome: _Outcome,
-    gamma: float,
-    env: VecNormalize | None,
-) -> Samples:
-    """Make a batch, as replay buffers do.
-
-    :param buffer: the replay buffer.
-    :param at: rows and environments ``[n]`` where the transitions begin.
-    :param actions: ``[n, act_dim]``, the first ones.
-    :param outcome: ``[n]``.
-    :param gamma: discount factor per step.
-    :param env: normalises observations.
-    :return: the batch, with discounts for the next observations' values.
-    """
-    first = buffer._normalize_obs(map_arrays(itemgetter(at), buffer.observations), env)
-    last = buffer._normalize_obs(outcome.observations, env)
-    samples = DictReplayBufferSamples if isinstance(first, dict) else ReplayBufferSamples
-    return samples(
-        map_arrays(buffer.to_torch, first),
-        buffer.to_torch(actions),
-        map_arrays(buffer.to_torch, last),
-        buffer.to_torch(outcome.terminated.astype(np.float32)[:, None]),
-        buffer.to_torch(outcome.returns.astype(np.float32)[:, None]),
-        buffer.to_torch((gamma**outcome.lengths).astype(np.float32)[:, None]),
-    )
+def _joined(fields: Sequence[Any]) -> Any:
+    if isinstance(fields[0], dict):
+        return {key: th.cat([field[key] for field in fields]) for key in fields[0]}
+    return th.cat(list(fields))

@@ -20,7 +20,8 @@ def check_buffer(buffer: Any) -> None:
     :param buffer: the replay buffer.
     :raises CheckpointError: names its class.
     """
-    if type(buffer) not in KNOWN:
+    # An expanded buffer writes its rows as the class does that it is made of.
+    if getattr(type(buffer), "base_class", type(buffer)) not in KNOWN:
         names = ", ".join(cls.__name__ for cls in KNOWN)
         raise CheckpointError(
             f"Which rows a {type(buffer).__name__} writes is not known, so it cannot be saved row by row. "

@@ -29,8 +29,8 @@ NOT_STATE: dict[type, dict[str, str]] = {
     BaseAlgorithm: {
         "start_time": "the time that was used so far is saved instead",
         "planner": "its forward model simulates the environments as they are; what it noticed is saved",
-        "_decision": "of the last step; made anew before it is read",
-        "_simulated_batches": "a view of the replay buffer",
+        "_prediction": "of the last step; made anew before it is read",
+        "_states": "of the last step; made anew before it is read",
         "_reasons_said": "what the user of this process was told",
         "_checked_env": "a view of the environment",
         "_resumption": "only there until a run was resumed",

@@ -7,11 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from sb3_mcbs.search.beam import OutOfTimeError, choose, join_rounds, rollout_values
-from sb3_mcbs.search.interface import CountedValue, FirstStep, PolicyFunctions, SearchResult
-from sb3_mcbs.search.proposals import draw_noise, propose, without_first
+from sb3_mcbs.search.beam import choose, join_rounds, short_horizon
+from sb3_mcbs.search.interface import (
+    CountedValue,
+    PolicyFunctions,
+    Rollouts,
+    Roots,
+    SearchResult,
+    policy_alone,
+)
+from sb3_mcbs.search.proposals import draw_noise, propose
 from sb3_mcbs.search.settings import SearchSettings
-from sb3_mcbs.types import ForwardModel, Observations
+from sb3_mcbs.types import ForwardModel, Transition
 
 #: How many past durations a forecast looks at, and which share of them it covers: of rounds, and of single
 #: steps, which are what makes a decision late.
@@ -109,26 +116,49 @@ class LatencyForecast:
         return width
 
 
-class _Watch:
-    """Asked before every step of a round whether to give up; learns how long the steps take."""
+class OutOfTimeError(Exception):
+    """A round was given up before its rollouts were finished."""
 
-    def __init__(self, pace: LatencyForecast, width: int, deadline: float) -> None:
-        self._pace, self._width, self._deadline = pace, width, deadline
+
+class _WatchedModel(ForwardModel):
+    """A forward model that gives a round up before a step that would be late, and learns how long steps take.
+
+    :param model: simulates.
+    :param pace: what is known of durations.
+    :param width: candidates of the round.
+    :param deadline: on the clock of ``pace``.
+
+    :ivar simulated_steps: until now.
+    """
+
+    def __init__(self, model: ForwardModel, pace: LatencyForecast, width: int, deadline: float) -> None:
+        self.deterministic = model.deterministic
+        self._model, self._pace, self._width, self._deadline = model, pace, width, deadline
         self._start = self._step_start = pace.clock()
         self._depth = -1
-        self.expected = 0.0
+        self._expected = 0.0
+        self.simulated_steps = 0
 
-    def __call__(self) -> bool:
-        now = self._pace.clock()
-        self._note_step(now)
-        self._depth += 1
-        self._step_start = now
-        steps = self._pace.of_step(self._width, self._depth)
-        step = steps.forecast(_SHARE_OF_STEPS)
-        self.expected = now - self._start + step
-        if not steps.known():
-            return now > self._deadline
-        return now + step + self._pace.ending.forecast(_SHARE_OF_STEPS) > self._deadline
+    @property
+    def n_rows(self) -> int:
+        return self._model.n_rows
+
+    def read_roots(self, env_indices: Sequence[int]) -> list[Any]:
+        return self._model.read_roots(env_indices)
+
+    def set_roots(self, roots: Sequence[Any], index: np.ndarray, rng: np.random.Generator) -> None:
+        self._model.set_roots(roots, index, rng)
+
+    def select(self, index: np.ndarray) -> None:
+        self._model.select(index)
+
+    def step(self, actions: np.ndarray) -> Transition:
+        if self._is_late():
+            self._pace.note_round(self._width, self._expected)
+            self._pace.of_step(self._width, self._depth).relax(_RELAX_STEP)
+            raise OutOfTimeError
+        self.simulated_steps += len(actions)
+        return self._model.step(actions)
 
     def finish(self) -> None:
         """The round is finished."""
@@ -136,10 +166,17 @@ class _Watch:
         self._note_step(now)
         self._pace.note_round(self._width, now - self._start)
 
-    def give_up(self) -> None:
-        """The round was given up."""
-        self._pace.note_round(self._width, self.expected)
-        self._pace.of_step(self._width, self._depth).relax(_RELAX_STEP)
+    def _is_late(self) -> bool:
+        now = self._pace.clock()
+        self._note_step(now)
+        self._depth += 1
+        self._step_start = now
+        steps = self._pace.of_step(self._width, self._depth)
+        step = steps.forecast(_SHARE_OF_STEPS)
+        self._expected = now - self._start + step
+        if not steps.known():
+            return now > self._deadline
+        return now + step + self._pace.ending.forecast(_SHARE_OF_STEPS) > self._deadline
 
     def _note_step(self, now: float) -> None:
         if self._depth >= 0:
@@ -147,9 +184,7 @@ class _Watch:
 
 
 def deadline_search(
-    model: ForwardModel,
-    roots: Sequence[Any],
-    observations: Observations,
+    roots: Roots,
     functions: PolicyFunctions,
     settings: SearchSettings,
     deadline: float,
@@ -162,9 +197,7 @@ def deadline_search(
     A round takes some candidates through all depths. Only finished rounds count; if there is none, the
     policy's own action is taken. The result depends on how fast the machine was.
 
-    :param model: simulates the candidates.
-    :param roots: present states of the environments.
-    :param observations: ``[n_envs, *obs_shape]``, present observations.
+    :param roots: where the rollouts start.
     :param functions: networks, discount and scales.
     :param settings: depth, simulations, noise, and the number of candidates that is enough.
     :param deadline: when to be done, on the clock of ``pace``.
@@ -173,64 +206,40 @@ def deadline_search(
     :param directions: ``[proposal_dims, act_dim]``, in which candidates differ; ``None``: in all.
     :return: actions, and what the search found.
     """
-    policy_actions = functions.policy(observations)
+    assert roots.model is not None
+    policy_actions = functions.policy(roots.observations)
+    n_envs, act_dim = policy_actions.shape
     value = CountedValue(functions.value)
     functions = functions._replace(value=value)
-    n_envs, act_dim = policy_actions.shape
     enough = settings.max_beam_width or settings.beam_width
-    candidates: list[np.ndarray] = []
-    values: list[np.ndarray] = []
-    first_steps: list[FirstStep] = []
-    simulated_steps = done = 0
+    rounds: list[Rollouts] = []
+    given_up = done = 0
     while done < enough:
         width = pace.affordable(deadline - pace.clock(), enough - done)
         if width == 0:
             break
-        watch = _Watch(pace, width, deadline)
+        watched = _WatchedModel(roots.model, pace, width, deadline)
         noise = draw_noise(rng, settings, n_envs, act_dim, width, directions)
         with_policy = settings.include_policy_action and done == 0
-        if with_policy:
-            noise = noise._replace(beam=without_first(noise.beam))
-        proposed = propose(policy_actions, noise.beam, with_policy)
+        candidates, beam_noise = propose(policy_actions, noise.beam, with_policy)
+        noise = noise._replace(beam=beam_noise)
         try:
-            round_values, first_step, steps = rollout_values(
-                model, roots, proposed, functions, settings, noise, rng, out_of_time=watch
+            evaluated = short_horizon(
+                roots._replace(model=watched), candidates, functions, settings, noise, rng
             )
-        except OutOfTimeError as reason:
-            simulated_steps += reason.simulated_steps
-            watch.give_up()
+        except OutOfTimeError:
+            given_up = watched.simulated_steps
             break
-        watch.finish()
-        candidates.append(proposed)
-        values.append(round_values)
-        first_steps.append(first_step)
-        simulated_steps += steps
+        watched.finish()
+        rounds.append(evaluated)
         done += width
 
     start = pace.clock()
-    if not done:
-        return _policy_alone(policy_actions, simulated_steps)._replace(critic_evaluations=value.evaluations)
-    merged = choose(
-        policy_actions,
-        np.concatenate(candidates, axis=1),
-        np.concatenate(values, axis=1),
-        join_rounds(first_steps, n_envs),
-        simulated_steps,
-    )
-    pace.ending.note(pace.clock() - start)
-    return merged._replace(rounds=len(candidates), critic_evaluations=value.evaluations)
-
-
-def _policy_alone(policy_actions: np.ndarray, simulated_steps: int) -> SearchResult:
-    n_envs, act_dim = policy_actions.shape
-    nothing = np.zeros((n_envs, 0))
-    return SearchResult(
-        actions=policy_actions,
-        chosen=np.full(n_envs, -1),
-        candidates=np.zeros((n_envs, 0, act_dim), dtype=policy_actions.dtype),
-        values=nothing,
-        first_step=None,
-        simulated_steps=simulated_steps,
-        invalid_rollouts=0,
-        rounds=0,
-    )
+    if rounds:
+        joined = join_rounds(rounds)
+        joined = joined._replace(simulated_steps=joined.simulated_steps + given_up)
+        result = choose(policy_actions, joined)._replace(rounds=len(rounds))
+        pace.ending.note(pace.clock() - start)
+    else:
+        result = policy_alone(policy_actions, given_up)
+    return result._replace(critic_evaluations=value.evaluations)

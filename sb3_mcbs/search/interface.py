@@ -4,12 +4,25 @@ Arrays in, arrays out. Actions are scaled to [-1, 1] here, as a policy network g
 Axes: ``n_envs`` environments, ``beam`` candidates, ``sim`` simulations, ``act_dim`` action entries.
 """
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_mcbs.types import Observations, Transition, take_rows
+from sb3_mcbs.types import ForwardModel, Observations, Transition, take_rows
+
+
+class Roots(NamedTuple):
+    """Where a search starts: the present states of the environments.
+
+    :param model: simulates from these states; ``None`` if ``rollout_depth`` is 0.
+    :param states: one per environment, from :meth:`ForwardModel.read_roots`.
+    :param observations: ``[n_envs, *obs_shape]``, present observations.
+    """
+
+    model: ForwardModel | None
+    states: Sequence[Any]
+    observations: Observations
 
 
 class PolicyFunctions(NamedTuple):
@@ -22,6 +35,7 @@ class PolicyFunctions(NamedTuple):
     :param gamma: discount factor per environment step.
     :param unscale_action: scaled actions ``[rows, act_dim]`` -> actions of the environment.
     :param scale_reward: rewards of the environment ``[rows]`` -> the scale that the critics know.
+    :param act_dim: entries of one action.
     """
 
     policy: Callable[[Observations], np.ndarray]
@@ -29,6 +43,7 @@ class PolicyFunctions(NamedTuple):
     gamma: float
     unscale_action: Callable[[np.ndarray], np.ndarray]
     scale_reward: Callable[[np.ndarray], np.ndarray]
+    act_dim: int
 
 
 class CountedValue:
@@ -59,6 +74,21 @@ class FirstStep(NamedTuple):
     rewards: np.ndarray
 
 
+class Rollouts(NamedTuple):
+    """Candidates, and what their rollouts gave.
+
+    :param candidates: ``[n_envs, beam, act_dim]``.
+    :param values: ``[n_envs, beam, sim]`` in float64, not finite where a simulation was invalid.
+    :param first_step: of every candidate, ``[n_envs * beam]``; ``None`` if nothing was simulated.
+    :param simulated_steps: environment steps, each counted once.
+    """
+
+    candidates: np.ndarray
+    values: np.ndarray
+    first_step: FirstStep | None
+    simulated_steps: int
+
+
 class SearchResult(NamedTuple):
     """The outcome of one decision in every environment.
 
@@ -76,6 +106,8 @@ class SearchResult(NamedTuple):
     :param rounds: finished rounds: 1, or any number if the search had a time budget, or ``n_rounds``.
     :param critic_evaluations: observations with an action that the critics rated.
     :param surviving_roots: of a tree: ``[n_envs]``, how many root actions still had a node at the end.
+    :param plans: of a refinement: ``[n_envs, rollout_depth, act_dim]``, the plans that the actions are from;
+        0 where none was valid.
     """
 
     actions: np.ndarray
@@ -88,6 +120,26 @@ class SearchResult(NamedTuple):
     rounds: int = 1
     critic_evaluations: int = 0
     surviving_roots: np.ndarray | None = None
+    plans: np.ndarray | None = None
+
+
+def policy_alone(policy_actions: np.ndarray, simulated_steps: int = 0) -> SearchResult:
+    """The outcome where no candidate was evaluated.
+
+    :param policy_actions: ``[n_envs, act_dim]``, to be executed.
+    :param simulated_steps: what was simulated in vain.
+    """
+    n_envs, act_dim = policy_actions.shape
+    return SearchResult(
+        actions=policy_actions,
+        chosen=np.full(n_envs, -1),
+        candidates=np.zeros((n_envs, 0, act_dim), dtype=policy_actions.dtype),
+        values=np.zeros((n_envs, 0)),
+        first_step=None,
+        simulated_steps=simulated_steps,
+        invalid_rollouts=0,
+        rounds=0,
+    )
 
 
 def stopped_values(step: Transition, functions: PolicyFunctions) -> tuple[np.ndarray, np.ndarray]:

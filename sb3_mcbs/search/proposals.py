@@ -90,29 +90,21 @@ def scale(noise: np.ndarray, spread: float | np.ndarray, settings: SearchSetting
     return noise
 
 
-def propose(policy_actions: np.ndarray, noise: np.ndarray, include_policy_action: bool) -> np.ndarray:
-    """Generate candidate actions (Algorithm 1, step 1).
+def propose(
+    policy_actions: np.ndarray, noise: np.ndarray, include_policy_action: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Generate candidate actions (Algorithm 1, lines 6 to 10).
 
     :param policy_actions: ``[n_envs, act_dim]``.
     :param noise: ``[n_envs, beam, act_dim]``.
     :param include_policy_action: whether the first candidate has no noise.
-    :return: ``[n_envs, beam, act_dim]`` in [-1, 1].
+    :return: candidates ``[n_envs, beam, act_dim]`` in [-1, 1], and the noise in them.
     """
     candidates = clip_actions(policy_actions[:, None] + noise)
     if include_policy_action:
-        candidates[:, 0] = policy_actions
-    return candidates
-
-
-def without_first(noise: np.ndarray) -> np.ndarray:
-    """Noise of candidates of which the first is the policy's own action.
-
-    :param noise: ``[n_envs, beam, act_dim]``.
-    :return: a copy, 0 for the first.
-    """
-    noise = noise.copy()
-    noise[:, 0] = 0
-    return noise
+        noise = noise.copy()
+        candidates[:, 0], noise[:, 0] = policy_actions, 0
+    return candidates, noise
 
 
 def preselect(values: np.ndarray, keep: int, always: int) -> np.ndarray:

@@ -6,17 +6,15 @@ that the noise of later steps belongs to the plan. With ``noise_hold`` above 1 a
 macro-step, and axes of ``rollout_depth`` count those.
 """
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from sb3_mcbs.search.beam import choose, join_rounds, mean_values, rollout_values
+from sb3_mcbs.search.beam import choose, join_rounds, mean_values, short_horizon
 from sb3_mcbs.search.directions import combine, gain
-from sb3_mcbs.search.interface import FirstStep, PolicyFunctions, SearchResult
+from sb3_mcbs.search.interface import PolicyFunctions, Rollouts, Roots, SearchResult
 from sb3_mcbs.search.proposals import Noise, best, critic_values, draw_normal, preselect, propose, scale
 from sb3_mcbs.search.settings import SearchSettings
-from sb3_mcbs.types import ForwardModel, Observations
 
 
 class Plans(NamedTuple):
@@ -48,70 +46,52 @@ def draw_plan_noise(
 
 
 def refine_search(
-    model: ForwardModel,
-    roots: Sequence[Any],
-    observations: Observations,
+    roots: Roots,
     functions: PolicyFunctions,
     settings: SearchSettings,
     noise: np.ndarray,
     rng: np.random.Generator,
     remembered: np.ndarray,
     directions: np.ndarray | None = None,
-) -> tuple[SearchResult, np.ndarray]:
+) -> SearchResult:
     """Choose one action per environment: the first action of the best plan of all rounds.
 
-    :param model: simulates the plans.
-    :param roots: present states of the environments.
-    :param observations: ``[n_envs, *obs_shape]``, present observations.
+    :param roots: where the rollouts start.
     :param functions: networks, discount and scales.
     :param settings: rounds, width, depth, elites and spreads.
     :param noise: from :func:`draw_plan_noise`.
     :param rng: given to a model with random dynamics.
     :param remembered: ``[n_envs, rollout_depth, act_dim]``, the plans to start around; 0 is the policy.
     :param directions: ``[proposal_dims, act_dim]``, in which plans differ from their mean; ``None``: in all.
-    :return: the actions and what the search found, and the plans that the actions are from,
-        ``[n_envs, rollout_depth, act_dim]``; 0 where none was valid.
+    :return: actions, and what the search found, with the plans that the actions are from.
     """
-    policy_actions = functions.policy(observations)
+    policy_actions = functions.policy(roots.observations)
     dims = remembered.shape[2] if directions is None else len(directions)
     beginning = first_spread(settings) * np.float32(gain(directions))
     source = Plans(remembered, np.broadcast_to(beginning, (*remembered.shape[:2], dims)))
     plans: list[np.ndarray] = []
-    candidates: list[np.ndarray] = []
-    values: list[np.ndarray] = []
-    first_steps: list[FirstStep] = []
-    simulated_steps = 0
+    rounds: list[Rollouts] = []
     for number, round_noise in enumerate(noise):
         if number:
-            known = np.concatenate(plans, axis=1), np.concatenate(values, axis=1)
-            source = refit(source, *known, settings, beginning, directions)
+            values = np.concatenate([each.values for each in rounds], axis=1)
+            source = refit(source, np.concatenate(plans, axis=1), values, settings, beginning, directions)
         offsets = combine(round_noise[..., :dims] * source.spread[:, None], directions)
         # The whole plan is clipped: rounds and decisions would otherwise carry its mean ever further.
         drawn = scale(source.mean[:, None] + offsets, 1.0, settings)
         always = _put_first(drawn, source.mean, settings.include_policy_action and number == 0)
-        proposed = propose(policy_actions, drawn[:, :, 0], include_policy_action=False)
+        proposed, _ = propose(policy_actions, drawn[:, :, 0], include_policy_action=False)
         if settings.n_proposals is not None:
-            kept = preselect(critic_values(observations, proposed, functions), settings.beam_width, always)
+            by_critics = critic_values(roots.observations, proposed, functions)
+            kept = preselect(by_critics, settings.beam_width, always)
             proposed = np.take_along_axis(proposed, kept[..., None], axis=1)
             drawn = np.take_along_axis(drawn, kept[..., None, None], axis=1)
-        found, first_step, steps = rollout_values(
-            model, roots, proposed, functions, settings, _as_noise(drawn, settings.n_simulations), rng
-        )
         plans.append(drawn)
-        candidates.append(proposed)
-        values.append(found)
-        first_steps.append(first_step)
-        simulated_steps += steps
-    result = choose(
-        policy_actions,
-        np.concatenate(candidates, axis=1),
-        np.concatenate(values, axis=1),
-        join_rounds(first_steps, len(policy_actions)),
-        simulated_steps,
-    )
+        noise_of_plans = _as_noise(drawn, settings.n_simulations)
+        rounds.append(short_horizon(roots, proposed, functions, settings, noise_of_plans, rng))
+    result = choose(policy_actions, join_rounds(rounds))
     chosen_plans = np.concatenate(plans, axis=1)[np.arange(len(policy_actions)), result.chosen]
     chosen_plans[result.chosen < 0] = 0
-    return result._replace(rounds=settings.n_rounds), chosen_plans
+    return result._replace(rounds=settings.n_rounds, plans=chosen_plans)
 
 
 def first_spread(settings: SearchSettings) -> np.ndarray:

@@ -1,61 +1,52 @@
 """The strategies by their names, behind one way to call them."""
 
 import logging
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
 
 import numpy as np
 
 from sb3_mcbs.search.beam import beam_search
-from sb3_mcbs.search.interface import CountedValue, PolicyFunctions, SearchResult
+from sb3_mcbs.search.interface import CountedValue, PolicyFunctions, Roots, SearchResult
 from sb3_mcbs.search.proposals import draw_noise
 from sb3_mcbs.search.refine import draw_plan_noise, refine_search
 from sb3_mcbs.search.settings import SearchSettings
 from sb3_mcbs.search.tree import draw_tree_noise, tree_search
-from sb3_mcbs.search.warm_start import EpisodeClock, WarmStart
-from sb3_mcbs.types import ForwardModel, Observations
+from sb3_mcbs.types import n_rows
 
 logger = logging.getLogger("sb3_mcbs")
 
 
-class Decision(NamedTuple):
-    """One decision in every environment.
-
-    :param model: simulates; may be ``None`` if ``rollout_depth`` is 0.
-    :param roots: present states of the environments, from :meth:`ForwardModel.read_roots`.
-    :param observations: ``[n_envs, *obs_shape]``, present observations.
-    :param functions: networks, discount and scales.
-    :param settings: settings of the search.
-    :param shape: ``(n_envs, act_dim)``.
-    :param rng: of the search: draws all noise, and is given to a model with random dynamics.
-    :param memory: of the strategy ``"refine"``.
-    :param envs: the environments that decide, by their numbers in the memory.
-    :param clocks: the present moment of each, for the memory.
-    :param directions: ``[proposal_dims, act_dim]``, in which candidates differ; ``None``: in all.
-    """
-
-    model: ForwardModel | None
-    roots: Sequence[Any]
-    observations: Observations
-    functions: PolicyFunctions
-    settings: SearchSettings
-    shape: tuple[int, int]
-    rng: np.random.Generator
-    memory: WarmStart | None = None
-    envs: Sequence[int] = ()
-    clocks: Sequence[EpisodeClock] = ()
-    directions: np.ndarray | None = None
-
-
-def search(decision: Decision) -> SearchResult:
+def search(
+    roots: Roots,
+    functions: PolicyFunctions,
+    settings: SearchSettings,
+    rng: np.random.Generator,
+    directions: np.ndarray | None = None,
+    plans: np.ndarray | None = None,
+) -> SearchResult:
     """Choose one action per environment by the strategy that the settings name.
 
-    :param decision: what there is to decide.
+    :param roots: where the search starts.
+    :param functions: networks, discount and scales.
+    :param settings: settings of the search.
+    :param rng: of the search: draws all noise, and is given to a model with random dynamics.
+    :param directions: ``[proposal_dims, act_dim]``, in which candidates differ; ``None``: in all.
+    :param plans: of a refinement: ``[n_envs, rollout_depth, act_dim]`` to start around; ``None``: 0.
     :return: actions, and what the search found.
     """
-    value = CountedValue(decision.functions.value)
-    strategy = STRATEGIES[decision.settings.strategy]
-    result = strategy(decision._replace(functions=decision.functions._replace(value=value)))
+    value = CountedValue(functions.value)
+    functions = functions._replace(value=value)
+    n_envs, act_dim = n_rows(roots.observations), functions.act_dim
+    if settings.strategy == "beam":
+        noise = draw_noise(rng, settings, n_envs, act_dim, directions=directions)
+        result = beam_search(roots, functions, settings, noise, rng)
+    elif settings.strategy == "tree":
+        tree_noise = draw_tree_noise(rng, settings, n_envs, act_dim, directions)
+        result = tree_search(roots, functions, settings, tree_noise, rng)
+    else:
+        if plans is None:
+            plans = np.zeros((n_envs, settings.rollout_depth, act_dim), dtype=np.float32)
+        plan_noise = draw_plan_noise(rng, settings, n_envs, act_dim)
+        result = refine_search(roots, functions, settings, plan_noise, rng, plans, directions)
     return result._replace(critic_evaluations=value.evaluations)
 
 
@@ -82,32 +73,3 @@ def check_dynamics(settings: SearchSettings, deterministic: bool) -> None:
             "is random in a simulation, so all would be the same.",
             settings.n_simulations,
         )
-
-
-def _beam(decision: Decision) -> SearchResult:
-    noise = draw_noise(decision.rng, decision.settings, *decision.shape, directions=decision.directions)
-    return beam_search(*decision[:5], noise, decision.rng)
-
-
-def _tree(decision: Decision) -> SearchResult:
-    assert decision.model is not None, "a tree needs a forward model"
-    noise = draw_tree_noise(decision.rng, decision.settings, *decision.shape, decision.directions)
-    return tree_search(decision.model, *decision[1:5], noise, decision.rng)
-
-
-def _refine(decision: Decision) -> SearchResult:
-    assert decision.model is not None, "a refinement needs a forward model"
-    assert decision.memory is not None, "a refinement remembers its plans"
-    noise = draw_plan_noise(decision.rng, decision.settings, *decision.shape)
-    hold = decision.settings.noise_hold
-    # The present macro-steps need not begin where those of the last decision did.
-    by_step = decision.memory.recall(decision.envs, decision.clocks)
-    remembered = by_step.reshape(len(by_step), -1, hold, by_step.shape[2]).mean(axis=2)
-    result, plans = refine_search(
-        decision.model, *decision[1:5], noise, decision.rng, remembered, decision.directions
-    )
-    decision.memory.keep(np.repeat(plans, hold, axis=1), decision.envs, decision.clocks)
-    return result
-
-
-STRATEGIES: dict[str, Callable[[Decision], SearchResult]] = {"beam": _beam, "tree": _tree, "refine": _refine}

@@ -5,14 +5,20 @@ forward model holds one row for each simulation that goes on, ordered by environ
 depth is a macro-step of ``noise_hold`` environment steps.
 """
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from sb3_mcbs.search.beam import choose
 from sb3_mcbs.search.directions import low_dimensional
-from sb3_mcbs.search.interface import FirstStep, PolicyFunctions, SearchResult, stopped_values
+from sb3_mcbs.search.interface import (
+    FirstStep,
+    PolicyFunctions,
+    Rollouts,
+    Roots,
+    SearchResult,
+    stopped_values,
+)
 from sb3_mcbs.search.proposals import (
     best,
     clip_actions,
@@ -21,7 +27,6 @@ from sb3_mcbs.search.proposals import (
     preselect,
     propose,
     scale,
-    without_first,
 )
 from sb3_mcbs.search.settings import SearchSettings
 from sb3_mcbs.types import ForwardModel, Observations, take_rows
@@ -108,9 +113,7 @@ def draw_tree_noise(
 
 
 def tree_search(
-    model: ForwardModel,
-    roots: Sequence[Any],
-    observations: Observations,
+    roots: Roots,
     functions: PolicyFunctions,
     settings: SearchSettings,
     noise: TreeNoise,
@@ -118,17 +121,17 @@ def tree_search(
 ) -> SearchResult:
     """Choose one action per environment: the root action of the best leaf.
 
-    :param model: simulates the nodes.
-    :param roots: present states of the environments.
-    :param observations: ``[n_envs, *obs_shape]``, present observations.
+    :param roots: where the tree starts.
     :param functions: networks, discount and scales.
     :param settings: width, branching, depth and simulations.
     :param noise: from :func:`draw_tree_noise`.
     :param rng: given to a model with random dynamics.
     :return: actions, and what the search found.
     """
+    model = roots.model
+    assert model is not None, "a tree needs a forward model"
     width, n_sim = settings.beam_width, settings.distinct_simulations(model.deterministic)
-    view = _View(observations, functions.policy(observations))
+    view = _View(roots.observations, functions.policy(roots.observations))
     policy_actions = view.policy_actions
     n_envs, n_roots = len(policy_actions), width * settings.branching
     nodes = _present(n_envs, n_sim)
@@ -143,7 +146,7 @@ def tree_search(
         parents = np.repeat(nodes.rows, children, axis=2)
         parents = parents[parents >= 0]
         if depth == 0:
-            model.set_roots(roots, parents, rng)
+            model.set_roots(roots.states, parents, rng)
         else:
             model.select(parents)
         growth = _grow(
@@ -162,7 +165,7 @@ def tree_search(
         nodes = _keep_best(ranking, width)
 
     leaves = _best_per_root(nodes, n_roots)
-    result = choose(policy_actions, candidates, leaves[..., None], first_step, simulated_steps)
+    result = choose(policy_actions, Rollouts(candidates, leaves[..., None], first_step, simulated_steps))
     return result._replace(
         values=estimates, invalid_rollouts=invalid, surviving_roots=np.isfinite(leaves).sum(axis=1)
     )
@@ -200,9 +203,7 @@ def _children(
     goes_on = nodes.rows >= 0
     rows = nodes.rows[goes_on]
     noise = np.broadcast_to(drawn[:, None], (*goes_on.shape, *drawn.shape[2:]))[goes_on]
-    if settings.include_policy_action:
-        noise = without_first(noise)
-    actions = propose(view.policy_actions[rows], noise, settings.include_policy_action)
+    actions, noise = propose(view.policy_actions[rows], noise, settings.include_policy_action)
     if settings.n_proposals is not None:
         values = np.zeros((*goes_on.shape, drawn.shape[2]))
         values[goes_on] = critic_values(take_rows(view.observations, rows), actions, functions)

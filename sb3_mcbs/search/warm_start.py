@@ -16,36 +16,39 @@ class WarmStart:
     all if the environment was reset or restored since.
 
     :param n_envs: number of environments.
-    :param rollout_depth: steps of a plan.
+    :param horizon: environment steps of a plan.
     :param act_dim: entries of one action.
     """
 
-    def __init__(self, n_envs: int, rollout_depth: int, act_dim: int) -> None:
-        self._plans = np.zeros((n_envs, rollout_depth, act_dim), dtype=np.float32)
+    def __init__(self, n_envs: int, horizon: int, act_dim: int) -> None:
+        #: By environment step: a decision's macro-steps need not begin where those of the last one did.
+        self._plans = np.zeros((n_envs, horizon, act_dim), dtype=np.float32)
         self._episode_clocks: list[EpisodeClock | None] = [None] * n_envs
 
-    def recall(self, envs: Sequence[int], now: Sequence[EpisodeClock]) -> np.ndarray:
+    def recall(self, envs: Sequence[int], now: Sequence[EpisodeClock], noise_hold: int = 1) -> np.ndarray:
         """Shift the plans by the steps since their decisions.
 
         :param envs: the environments that decide.
         :param now: the present moment of each.
-        :return: ``[len(envs), rollout_depth, act_dim]``; 0, the policy's own action, where nothing is left.
+        :param noise_hold: environment steps in a macro-step.
+        :return: ``[len(envs), rollout_depth, act_dim]``, by macro-steps; 0 where nothing is left.
         """
-        depth = self._plans.shape[1]
+        horizon = self._plans.shape[1]
         recalled = np.zeros((len(envs), *self._plans.shape[1:]), dtype=self._plans.dtype)
         for row, (env, age) in enumerate(zip(envs, self._ages(envs, now), strict=True)):
-            if 0 <= age < depth:
-                recalled[row, : depth - age] = self._plans[env, age:]
-        return recalled
+            if 0 <= age < horizon:
+                recalled[row, : horizon - age] = self._plans[env, age:]
+        return recalled.reshape(len(envs), -1, noise_hold, recalled.shape[2]).mean(axis=2)
 
     def keep(self, plans: np.ndarray, envs: Sequence[int], now: Sequence[EpisodeClock]) -> None:
         """Remember the plans of a decision.
 
-        :param plans: ``[len(envs), rollout_depth, act_dim]``.
+        :param plans: ``[len(envs), rollout_depth, act_dim]``, by macro-steps.
         :param envs: the environments that decided.
         :param now: the present moment of each.
         """
-        for plan, env, moment in zip(plans, envs, now, strict=True):
+        by_step = np.repeat(plans, self._plans.shape[1] // plans.shape[1], axis=1)
+        for plan, env, moment in zip(by_step, envs, now, strict=True):
             self._plans[env] = plan
             self._episode_clocks[env] = moment
 
