@@ -235,7 +235,7 @@ def test_networks_are_there_before_learn(tmp_path):
     agent.save(tmp_path / "saved")
     loaded = MCBSTD3.load(tmp_path / "saved")
     assert np.array_equal(agent.predict(observation)[0], loaded.predict(observation)[0])
-    assert not {"_resumption", "_setup_learn"} & set(vars(loaded))
+    assert not {"_stopped_run", "_setup_learn"} & set(vars(loaded))
     fresh = RUNS["MCBSTD3"](tmp_path / "fresh")
     assert not np.array_equal(agent.predict(observation)[0], fresh.predict(observation)[0])
 

@@ -9,7 +9,6 @@ import numpy as np
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
@@ -39,6 +38,7 @@ from sb3_mcbs.agents.learned_model import (
 )
 from sb3_mcbs.agents.learned_search import make_searcher
 from sb3_mcbs.agents.planner import Searcher
+from sb3_mcbs.agents.resumable import Resumable
 from sb3_mcbs.agents.schedule import ScheduleSettings, SearchSchedule
 from sb3_mcbs.agents.simulated_batches import SimulatedBatches
 from sb3_mcbs.networks.torch_settings import matmul_precision
@@ -48,7 +48,7 @@ from sb3_mcbs.search.random_streams import spawn_rng
 SelfMCBS = TypeVar("SelfMCBS", bound="MCBS")
 
 
-class MCBS(SearchAttributes, OffPolicyAlgorithm):
+class MCBS(SearchAttributes, Resumable):
     """
     Monte Carlo Beam Search for an off-policy agent of SB3: the mixin that stands before it.
 
@@ -65,6 +65,13 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
     docstring of such a class the settings are listed one by one where ``search_settings`` was written.
     """
 
+    #: What neither ``save`` nor an exact checkpoint contains, and why.
+    not_checkpointed: ClassVar[dict[str, str]] = {
+        "_searcher": "its forward model simulates the environments as they are; what it remembers is saved",
+        "_decision": "of the last step; made anew before it is read",
+        "_simulated_batches": "a view of the replay buffer",
+        "_checked_env": "a view of the environment",
+    }
     #: Set by ``sb3_mcbs.checkpoints``, which knows the agents, and not the other way round.
     _resume_as: ClassVar[Callable[..., Any]]
     _seed_at_setup: int | None = None
@@ -506,5 +513,14 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         return super().predict(observation, state, episode_start, deterministic)
 
     def _excluded_save_params(self) -> list[str]:
-        transient = ["_searcher", "_decision", "_checked_env", "_simulated_batches", "_noise_without_search"]
-        return [*super()._excluded_save_params(), *transient]
+        # The noise is made anew by learn(), which an exact checkpoint is in the middle of.
+        return [*super()._excluded_save_params(), *MCBS.not_checkpointed, "_noise_without_search"]
+
+    def _search_memory(self) -> dict[str, Any]:
+        assert self._searcher is not None
+        return self._searcher.memory
+
+    def _go_on_searching(self, memory: dict[str, Any]) -> None:
+        self._follow_settings()  # a callback may have changed them
+        assert self._searcher is not None
+        self._searcher.memory = memory

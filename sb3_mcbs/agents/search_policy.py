@@ -4,7 +4,7 @@ import operator
 from copy import copy, deepcopy
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -50,6 +50,12 @@ class SearchPolicy:
     :param search_settings: the fields of :class:`~sb3_mcbs.SearchSettings`; those not given are
         those that the agent trained with, or the preset's, or the defaults
     """
+
+    #: What an exact checkpoint does not contain, and why.
+    not_checkpointed: ClassVar[dict[str, str]] = {
+        "searcher": "its forward model simulates the environments as they are; what it remembers is saved",
+        "last_result": "of the last step; made anew before it is read",
+    }
 
     def __init__(
         self,
@@ -157,6 +163,13 @@ class SearchPolicy:
         self.searcher.note_actions(self.last_result.actions)
         actions = self.searcher.unscale(self.last_result.actions)
         return (actions[0] if is_single else actions), state
+
+    def _search_memory(self) -> dict[str, Any]:
+        return self.searcher.memory
+
+    def _go_on_searching(self, memory: dict[str, Any]) -> None:
+        self._follow_settings()  # a callback may have changed them
+        self.searcher.memory = memory
 
     def close(self) -> None:
         """Release the forward model. The agent and the environment stay open."""

@@ -7,7 +7,7 @@ import signal
 import sys
 import warnings
 from types import FrameType
-from typing import Any
+from typing import Any, ClassVar
 
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -17,7 +17,7 @@ from sb3_mcbs.checkpoints.encoding import in_section
 from sb3_mcbs.checkpoints.errors import CheckpointError
 from sb3_mcbs.checkpoints.files import describe_format
 from sb3_mcbs.checkpoints.interrupts import Interrupts, TrainingInterrupted
-from sb3_mcbs.checkpoints.resumption import SETTINGS, Resumption, pending
+from sb3_mcbs.checkpoints.resume import SETTINGS, run_of
 from sb3_mcbs.checkpoints.settings import circumstances, describe_agent, describe_vec_env, inexact
 from sb3_mcbs.checkpoints.state import RunState
 from sb3_mcbs.checkpoints.store import Store
@@ -49,17 +49,13 @@ class ExactCheckpointCallback(BaseCallback):
     :param verbose: Verbosity level: 0 for no output, 1 for a line per checkpoint
     """
 
-    #: Made anew when training begins.
-    not_checkpointed: tuple[str, ...] = (
-        "store",
-        "_run",
-        "_interrupts",
-        "_settings",
-        "_vec_env",
-        "_parts",
-        "_begun",
-        "path",
-    )
+    not_checkpointed: ClassVar[dict[str, str]] = {
+        "path": "where to write is not for a checkpoint to decide",
+        **dict.fromkeys(
+            ("store", "_run", "_interrupts", "_settings", "_vec_env", "_parts", "_begun"),
+            "made anew when training begins",
+        ),
+    }
 
     def __init__(
         self, save_freq: int, path: str | os.PathLike[str] | None = None, keep_last: int = 2, verbose: int = 0
@@ -109,8 +105,8 @@ class ExactCheckpointCallback(BaseCallback):
             )
 
     def _is_resumed_here(self) -> bool:
-        resumption = pending(self.model)
-        return resumption is not None and resumption.store.folder.resolve() == self.store.folder.resolve()
+        stopped = run_of(self.model)
+        return stopped is not None and stopped.store.folder.resolve() == self.store.folder.resolve()
 
     def _on_training_start(self) -> None:
         self._check_place()
@@ -133,7 +129,7 @@ class ExactCheckpointCallback(BaseCallback):
 
     def _on_training_end(self) -> None:
         assert isinstance(self.model, OffPolicyAlgorithm)
-        if pending(self.model) is not None:
+        if run_of(self.model) is not None:
             self._begin(self.model)
         stopped_by = self._interrupts.received
         if self._run is not None and stopped_by is not None:
@@ -156,12 +152,12 @@ class ExactCheckpointCallback(BaseCallback):
         self._vec_env = describe_vec_env(agent.env)
         self._position, self._rows_added = agent.replay_buffer.pos, rows_held(agent.replay_buffer)
         self._n_calls_then, self._next_save, self._parts = self.n_calls, self.num_timesteps, []
-        resumption: Resumption | None = pending(agent)
-        if resumption is not None:
+        stopped = run_of(agent)
+        if stopped is not None:
             resumed_here = self._is_resumed_here()
-            resumption.carry_out(agent, self._run, self._settings)
+            stopped.put_back(agent, self._run, self._settings)
             if resumed_here:
-                self._parts = resumption.checkpoint.manifest["rows"]
+                self._parts = stopped.checkpoint.manifest["rows"]
             (self.store.folder / MARK).unlink(missing_ok=True)
         self._interrupts.begin(self._run.worker_environments)
 

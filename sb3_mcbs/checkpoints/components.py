@@ -1,4 +1,4 @@
-"""What a run consists of, and which of its attributes are not state, each with the reason."""
+"""What a run consists of, and which of its attributes are not state."""
 
 import os
 import re
@@ -24,23 +24,12 @@ _FILE = "an open file; its content is saved"
 #: The end of a word in the names of attributes that say where something is written.
 _PLACE = re.compile(r"(path|dir|directory|folder|file|filename|prefix)(_|$)")
 
-#: Class (and those derived from it) -> attribute -> why it is neither saved nor restored.
+#: Class of SB3 or torch (and those derived from it) -> attribute -> why it is neither saved nor restored.
+#: This package's classes say so themselves, as ``not_checkpointed``; so may those of the user.
 NOT_STATE: dict[type, dict[str, str]] = {
     BaseAlgorithm: {
         "start_time": "the time that was used so far is saved instead",
-        "_searcher": "its forward model simulates the environments as they are; what it noticed is saved",
-        "_decision": "of the last step; made anew before it is read",
-        "_simulated_batches": "a view of the replay buffer",
-        "_reasons_said": "what the user of this process was told",
-        "_checked_env": "a view of the environment",
-        "_resumption": "only there until a run was resumed",
-        "_setup_learn": "only replaced until a run was resumed",
-        "_excluded_save_params": "only replaced until a run was resumed",
         "tensorboard_log": "a setting, which was checked when the run was resumed",
-    },
-    SearchPolicy: {
-        "searcher": "its forward model simulates the environments as they are; what it noticed is saved",
-        "last_result": "of the last step; made anew before it is read",
     },
     nn.Module: {
         "_parameters": "saved as state_dict",
@@ -96,8 +85,9 @@ def not_state_of(component: Any, saved: Iterable[str] = ()) -> frozenset[str]:
         names |= row_attributes(component)
     if isinstance(component, BaseCallback | VecEnv):
         names |= {name for name in {*vars(component), *saved} if _is_place(component, name)}
-    own = getattr(type(component), "not_checkpointed", ())
-    return frozenset(names | set(own))
+    for cls in type(component).__mro__:
+        names |= set(vars(cls).get("not_checkpointed", ()))
+    return frozenset(names)
 
 
 def _is_place(component: Any, name: str) -> bool:

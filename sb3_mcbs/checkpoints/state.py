@@ -10,9 +10,8 @@ from stable_baselines3.common.logger import KVWriter
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecMonitor
 
-from sb3_mcbs.agents import SearchPolicy
-from sb3_mcbs.agents.attributes import SearchAttributes
 from sb3_mcbs.agents.observation_pipeline import snapshot_environments
+from sb3_mcbs.agents.resumable import Searching
 from sb3_mcbs.checkpoints.components import components, layers_of, not_state_of
 from sb3_mcbs.checkpoints.encoding import Decoder, Encoded, Encoder, in_section, of_section
 from sb3_mcbs.checkpoints.environments import (
@@ -146,7 +145,7 @@ class RunState:
                 raise CheckpointError(_refusal(name, part, error)) from error
         rest = {
             "seconds": (time.time_ns() - self._agent.start_time) / 1e9,
-            "searchers": {name: searcher.memory for name, searcher in self._searchers().items()},
+            "searchers": {name: part._search_memory() for name, part in self._searching().items()},
             "files": {name: self._written(part) for name, part in parts.items()},
             "generators": read_generators(),
         }
@@ -183,11 +182,8 @@ class RunState:
     def _set_rest(self, rest: dict[str, Any]) -> None:
         agent = self._agent
         agent.start_time = time.time_ns() - int(rest["seconds"] * 1e9)
-        for part in self._components.values():
-            if isinstance(part, SearchAttributes | SearchPolicy):  # a callback may have changed its settings
-                part._follow_settings()
-        for name, searcher in self._searchers().items():
-            searcher.memory = rest["searchers"][name]
+        for name, part in self._searching().items():
+            part._go_on_searching(rest["searchers"][name])
         open_log_files(agent.logger)
         for name, written in rest["files"].items():
             if written is not None:
@@ -195,13 +191,8 @@ class RunState:
         # Last, since whatever is made on the way may draw from them.
         set_generators(rest["generators"])
 
-    def _searchers(self) -> dict[str, Any]:
-        found = {}
-        for name, part in self._components.items():
-            searcher = vars(part).get("_searcher", vars(part).get("searcher"))
-            if searcher is not None and not isinstance(part, th.nn.Module):
-                found[name] = searcher
-        return found
+    def _searching(self) -> dict[str, Searching]:
+        return {name: part for name, part in self._components.items() if isinstance(part, Searching)}
 
     def _file(self, part: Any) -> Any:
         if isinstance(part, KVWriter):
