@@ -141,6 +141,14 @@ def test_the_runs_parts_are_not_skipped_by_their_own_list(tmp_path):
     ) == set()
 
 
+class LateProbe(Probe):
+    not_checkpointed = ("late",)
+
+
+def test_a_class_adds_to_what_its_bases_leave_out():
+    assert {"found", "late"} <= not_state_of(LateProbe())
+
+
 class Chooser(BaseCallback):
     """Holds a function or a class: from step 30 on another one than before."""
 

@@ -1,7 +1,7 @@
 """What makes an off-policy agent look ahead before it acts, whatever it learns by."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from copy import copy
 from typing import Any, ClassVar, TypeVar
 
@@ -38,7 +38,7 @@ from sb3_mcbs.agents.learned_model import (
 )
 from sb3_mcbs.agents.learned_search import make_searcher
 from sb3_mcbs.agents.planner import Searcher
-from sb3_mcbs.agents.resumable import Resumable
+from sb3_mcbs.agents.resumable import Resumable, Searching
 from sb3_mcbs.agents.schedule import ScheduleSettings, SearchSchedule
 from sb3_mcbs.agents.simulated_batches import SimulatedBatches
 from sb3_mcbs.networks.torch_settings import matmul_precision
@@ -48,7 +48,7 @@ from sb3_mcbs.search.random_streams import spawn_rng
 SelfMCBS = TypeVar("SelfMCBS", bound="MCBS")
 
 
-class MCBS(SearchAttributes, Resumable):
+class MCBS(SearchAttributes, Searching, Resumable):
     """
     Monte Carlo Beam Search for an off-policy agent of SB3: the mixin that stands before it.
 
@@ -66,7 +66,7 @@ class MCBS(SearchAttributes, Resumable):
     """
 
     #: What neither ``save`` nor an exact checkpoint contains, and why.
-    not_checkpointed: ClassVar[dict[str, str]] = {
+    not_checkpointed: ClassVar[Collection[str]] = {
         "_searcher": "its forward model simulates the environments as they are; what it remembers is saved",
         "_decision": "of the last step; made anew before it is read",
         "_simulated_batches": "a view of the replay buffer",

@@ -1,6 +1,8 @@
 """What exact checkpoints need of an agent. They know the agents, and not the other way round."""
 
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from abc import ABC, abstractmethod
+from collections.abc import Collection
+from typing import Any, ClassVar, Protocol
 
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -24,7 +26,7 @@ class Resumable(OffPolicyAlgorithm):
     the call of ``learn`` checked.
     """
 
-    not_checkpointed: ClassVar[dict[str, str]] = {"_stopped_run": "only there until the run goes on"}
+    not_checkpointed: ClassVar[Collection[str]] = {"_stopped_run": "only there until the run goes on"}
     _stopped_run: StoppedRun | None = None
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
@@ -37,13 +39,14 @@ class Resumable(OffPolicyAlgorithm):
         return [*super()._excluded_save_params(), *Resumable.not_checkpointed]
 
 
-@runtime_checkable
-class Searching(Protocol):
+class Searching(ABC):
     """Something that searches: its search remembers more than its attributes say."""
 
+    @abstractmethod
     def _search_memory(self) -> dict[str, Any]:
         """Return what the search remembers."""
 
+    @abstractmethod
     def _go_on_searching(self, memory: dict[str, Any]) -> None:
         """Search on as another one did, once all attributes are put back.
 

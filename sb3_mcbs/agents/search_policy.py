@@ -1,6 +1,7 @@
 """Act with search with any trained agent."""
 
 import operator
+from collections.abc import Collection
 from copy import copy, deepcopy
 from dataclasses import replace
 from functools import partial
@@ -15,6 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from sb3_mcbs.agents.hyperparameters import REMOVED, SETTING_NAMES, refuse_removed, settings_of_preset
 from sb3_mcbs.agents.learned_search import make_searcher
 from sb3_mcbs.agents.mcbs import MCBS
+from sb3_mcbs.agents.resumable import Searching
 from sb3_mcbs.search import SearchResult, SearchSettings, with_preset
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 
@@ -22,7 +24,7 @@ from sb3_mcbs.snapshot import SnapshotEnvWrapper
 _HELD = ("model", "vec_env", "settings", "preset")
 
 
-class SearchPolicy:
+class SearchPolicy(Searching):
     """
     A trained agent that looks ahead before it acts, with SB3's ``predict`` signature.
 
@@ -52,7 +54,7 @@ class SearchPolicy:
     """
 
     #: What an exact checkpoint does not contain, and why.
-    not_checkpointed: ClassVar[dict[str, str]] = {
+    not_checkpointed: ClassVar[Collection[str]] = {
         "searcher": "its forward model simulates the environments as they are; what it remembers is saved",
         "last_result": "of the last step; made anew before it is read",
     }

@@ -116,11 +116,20 @@ def components(agent: OffPolicyAlgorithm, callback: BaseCallback) -> dict[str, A
         found[name] = each
         if isinstance(each.model, SearchPolicy):
             found[f"{name}.model"] = each.model
-    for name, vec_env in list(vec_envs(agent, found)):
+    # The agent's environment, and those that callbacks evaluate in.
+    vec_envs = {"agent.env": agent.env}
+    for name, part in found.items():
+        if isinstance(part, BaseCallback | SearchPolicy):
+            held = vars(part).items()
+            vec_envs |= {
+                f"{name}.{attribute}": value for attribute, value in held if isinstance(value, VecEnv)
+            }
+    for name, vec_env in vec_envs.items():
+        assert vec_env is not None
         for depth, layer in enumerate(layers_of(vec_env)):
             found[f"{name}.layers[{depth}]"] = layer
-    seen: set[int] = set()
-    return {name: part for name, part in found.items() if not (id(part) in seen or seen.add(id(part)))}  # type: ignore[func-returns-value]
+    first_names = {id(part): name for name, part in reversed(found.items())}
+    return {name: found[name] for name in found if first_names[id(found[name])] == name}
 
 
 def callbacks(name: str, callback: BaseCallback) -> Iterator[tuple[str, BaseCallback]]:
@@ -139,21 +148,6 @@ def callbacks(name: str, callback: BaseCallback) -> Iterator[tuple[str, BaseCall
             for index, item in enumerate(value):
                 if isinstance(item, BaseCallback):
                     yield from callbacks(f"{name}.{attribute}[{index}]", item)
-
-
-def vec_envs(agent: OffPolicyAlgorithm, found: dict[str, Any]) -> Iterator[tuple[str, VecEnv]]:
-    """Find the vectorized environments: the agent's, and those that callbacks evaluate in.
-
-    :param agent: the agent.
-    :param found: components by name.
-    """
-    assert agent.env is not None
-    yield "agent.env", agent.env
-    for name, part in found.items():
-        if isinstance(part, BaseCallback | SearchPolicy):
-            for attribute, value in vars(part).items():
-                if isinstance(value, VecEnv):
-                    yield f"{name}.{attribute}", value
 
 
 def layers_of(vec_env: VecEnv) -> Iterator[VecEnv]:

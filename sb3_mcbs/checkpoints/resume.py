@@ -21,7 +21,7 @@ from sb3_mcbs.checkpoints.errors import CheckpointError
 from sb3_mcbs.checkpoints.files import check_below, make_logger
 from sb3_mcbs.checkpoints.names import known_names
 from sb3_mcbs.checkpoints.settings import check_settings, circumstances, log_files, make_agent, make_vec_env
-from sb3_mcbs.checkpoints.state import Captured, RunState, set_networks
+from sb3_mcbs.checkpoints.state import RunState, set_networks
 from sb3_mcbs.checkpoints.store import STEP, Checkpoint, Store
 
 logger = logging.getLogger("sb3_mcbs")
@@ -72,7 +72,7 @@ def resume(
     agent = make_agent(run.settings, known_names(run.classes), env)
     if agent.tensorboard_log is not None:
         check_below(agent.tensorboard_log, roots)
-    set_networks(agent, run.checkpoint.arrays)
+    set_networks(agent, run.checkpoint.state.arrays)
     run.continue_with(agent, log_folder)
     return agent
 
@@ -109,7 +109,7 @@ def read_run(path: str | os.PathLike[str], classes: Iterable[Any] = ()) -> "Chec
         checkpoint = store.read(int(path.name.removeprefix(STEP)))
     else:
         store = Store(path)
-        checkpoint = store.read_newest(lambda message: warnings.warn(message, stacklevel=4))
+        checkpoint = store.read_newest()
     return CheckpointedRun(store, checkpoint, tuple(classes))
 
 
@@ -132,7 +132,9 @@ class CheckpointedRun:
     @property
     def settings(self) -> Encoded:
         """The settings of the saved agent."""
-        return Encoded(self.checkpoint.manifest["settings"], of_section(SETTINGS, self.checkpoint.arrays))
+        return Encoded(
+            self.checkpoint.manifest["settings"], of_section(SETTINGS, self.checkpoint.state.arrays)
+        )
 
     def roots(self, log_folder: str | os.PathLike[str] | None) -> list[Path]:
         """Return the folders that log files may be in.
@@ -198,9 +200,8 @@ class CheckpointedRun:
         """
         check_settings(self.settings, settings)
         assert isinstance(agent, Resumable) and agent.replay_buffer is not None
-        checkpoint = self.checkpoint
-        write_rows(agent.replay_buffer, self.store.read_rows(checkpoint.manifest["rows"]))
-        run.restore(Captured(checkpoint.state, checkpoint.arrays), self.classes)
+        write_rows(agent.replay_buffer, self.store.read_rows(self.checkpoint.manifest["rows"]))
+        run.restore(self.checkpoint.state, self.classes)
         self.goes_on = True
         del agent._stopped_run
         agent.__class__ = self._class_of_agent

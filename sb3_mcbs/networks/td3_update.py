@@ -7,7 +7,7 @@ so both give the same networks up to float32 rounding.
 """
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from typing import Any, ClassVar
 
@@ -168,7 +168,7 @@ class FastUpdate(TD3):
     """
 
     #: What neither ``save`` nor an exact checkpoint contains, and why.
-    not_checkpointed: ClassVar[dict[str, str]] = {"_reasons_said": "what the user of this process was told"}
+    not_checkpointed: ClassVar[Collection[str]] = {"_reasons_said": "what the user of this process was told"}
     #: Whether to; ``False`` leaves gradient steps to SB3.
     fast_update: bool
     #: Why they were left to SB3 although it is True, as far as the user was told.

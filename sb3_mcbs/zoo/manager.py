@@ -49,7 +49,7 @@ class ResumedRun(NamedTuple):
     A run that is continued instead of a new one.
 
     :param folder: its folder
-    :param checkpointed: it, as its newest checkpoint has it
+    :param checkpointed: the run, as its newest checkpoint has it
     :param log_folder: its folder for TensorBoard, if it has one
     """
 
