@@ -27,7 +27,7 @@ N_ENVS = 4
 class TimedCheckpoints(ExactCheckpointCallback):
     """Adds up the time that checkpoints take."""
 
-    not_checkpointed = (*ExactCheckpointCallback.not_checkpointed, "seconds")
+    not_checkpointed = ("seconds",)
 
     def __init__(self, save_freq: int, path: Path) -> None:
         super().__init__(save_freq, path)

@@ -9,10 +9,11 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecMonitor, VecNormalize
 
-from sb3_mcbs import MCBSTD3, ExactCheckpointCallback, SearchPolicy, resume
+from sb3_mcbs import MCBS, MCBSTD3, ExactCheckpointCallback, SearchPolicy, resume
 from sb3_mcbs.checkpoints import CheckpointError
 from sb3_mcbs.checkpoints.components import NOT_STATE, components, not_state_of
 from sb3_mcbs.checkpoints.state import RUN, RunState
+from sb3_mcbs.networks.td3_update import FastUpdate
 from tests.checkpoint_helpers import crash, learn
 from tests.test_checkpoints import make_env, maker
 
@@ -104,6 +105,7 @@ def all_kinds_of_runs(folder):
 
 def test_every_attribute_is_captured_or_left_out_for_a_reason(tmp_path):
     left_out: set[tuple[type, str]] = set()
+    all_reasons = dict(NOT_STATE)
     for agent, callback in all_kinds_of_runs(tmp_path):
         callback.model = agent
         for each in callback.callbacks:
@@ -111,23 +113,20 @@ def test_every_attribute_is_captured_or_left_out_for_a_reason(tmp_path):
         run = RunState(agent, callback)
         captured = run.capture().json[RUN]["attributes"]
         for name, part in components(agent, callback).items():
+            for cls in type(part).__mro__:
+                if isinstance(vars(cls).get("not_checkpointed"), dict):
+                    all_reasons[cls] = vars(cls)["not_checkpointed"]
             not_state = not_state_of(part)
             content = captured[name]["dict"]
             assert {key for key, _ in content} == set(vars(part)) - not_state, name
-            for cls, reasons in NOT_STATE.items():
+            for cls, reasons in all_reasons.items():
                 if isinstance(part, cls):
                     left_out |= {(cls, attribute) for attribute in set(vars(part)) & set(reasons)}
-    assert all(reason for reasons in NOT_STATE.values() for reason in reasons.values())
-    only_at_times = {
-        "_resumption",
-        "_setup_learn",
-        "_excluded_save_params",
-        "_renaming_logger",
-        "_checked_env",
-        "pbar",
-    }
+    assert {MCBS, FastUpdate, SearchPolicy, ExactCheckpointCallback} < all_reasons.keys()
+    assert all(reason for reasons in all_reasons.values() for reason in reasons.values())
+    only_at_times = {"_stopped_run", "_checked_env", "pbar", "store", "_settings", "_vec_env"}
     expected = {
-        (cls, name) for cls, reasons in NOT_STATE.items() for name in reasons if name not in only_at_times
+        (cls, name) for cls, reasons in all_reasons.items() for name in reasons if name not in only_at_times
     }
     assert expected - left_out == set(), "a reason for an attribute that is no longer there"
 
@@ -140,6 +139,14 @@ def test_the_runs_parts_are_not_skipped_by_their_own_list(tmp_path):
     assert {"n_calls", "num_timesteps", "save_freq", "_next_save", "_rows_added"} & not_state_of(
         callback
     ) == set()
+
+
+class LateProbe(Probe):
+    not_checkpointed = ("late",)
+
+
+def test_a_class_adds_to_what_its_bases_leave_out():
+    assert {"found", "late"} <= not_state_of(LateProbe())
 
 
 class Chooser(BaseCallback):

@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 from stable_baselines3 import DDPG
 
-from sb3_mcbs import CheckpointError, ExactCheckpointCallback, resume
+from sb3_mcbs import MCBSTD3, CheckpointError, ExactCheckpointCallback, resume
+from sb3_mcbs.agents.hyperparameters import REMOVED
 from sb3_mcbs.checkpoints import register_state, store
 from sb3_mcbs.checkpoints.encoding import Decoder, Encoder
+from sb3_mcbs.checkpoints.resume import read_run
 from sb3_mcbs.checkpoints.store import Store, write_arrays, write_file
 from sb3_mcbs.snapshot import SnapshotUnsupportedError
 from tests.checkpoint_helpers import CrashAt, assert_same_parameters, crash, learn
@@ -232,6 +234,25 @@ def reseal(checkpoint, name):
         return json.dumps({**manifest, "files": {**manifest["files"], name: seal}})
 
     change_manifest(checkpoint, change)
+
+
+@pytest.mark.parametrize("name", REMOVED)
+def test_a_run_from_before_a_setting_was_removed(name, tmp_path):
+    """By an agent of its own, and by one that is there already, as in RL Zoo."""
+    crash(maker(MCBSTD3), tmp_path, 60, 45)
+    with_setting = json.dumps({name: REMOVED[name][0]})[1:-1]
+    for step in Store(tmp_path / "checkpoints").steps():
+        checkpoint = Store(tmp_path / "checkpoints").path_of(step)
+        change_manifest(
+            checkpoint, lambda text: text.replace('"beam_noise"', f'{with_setting}, "beam_noise"', 1)
+        )
+    message = rf"settings that were removed since then: {name} \(.+\)\. Continue it with the version"
+    with pytest.raises(CheckpointError, match=message):
+        resume(tmp_path / "checkpoints")
+    agent = maker(MCBSTD3)(tmp_path)
+    read_run(tmp_path / "checkpoints").continue_with(agent)
+    with pytest.raises(CheckpointError, match=message):
+        learn(agent, tmp_path, 60)
 
 
 class TestHostile:

@@ -235,9 +235,21 @@ def test_networks_are_there_before_learn(tmp_path):
     agent.save(tmp_path / "saved")
     loaded = MCBSTD3.load(tmp_path / "saved")
     assert np.array_equal(agent.predict(observation)[0], loaded.predict(observation)[0])
-    assert not {"_resumption", "_setup_learn"} & set(vars(loaded))
+    assert not {"_stopped_run", "_setup_learn"} & set(vars(loaded))
     fresh = RUNS["MCBSTD3"](tmp_path / "fresh")
     assert not np.array_equal(agent.predict(observation)[0], fresh.predict(observation)[0])
+
+
+def test_an_agent_of_sb3_is_what_it_was(tmp_path):
+    """Until the run goes on it has a second base class, which nobody need know of."""
+    crash(RUNS["DDPG, large buffer"], tmp_path, 150, 105)
+    agent = resume(tmp_path / "checkpoints")
+    assert isinstance(agent, DDPG) and type(agent).__name__ == "DDPG"
+    agent.save(tmp_path / "saved")
+    loaded = DDPG.load(tmp_path / "saved")
+    learn(agent, tmp_path, 150)
+    for each in (agent, loaded):
+        assert type(each) is DDPG and not {"_stopped_run", "_setup_learn"} & set(vars(each))
 
 
 def test_settings_are_those_of_the_run(tmp_path):

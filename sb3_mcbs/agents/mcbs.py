@@ -1,7 +1,7 @@
 """What makes an off-policy agent look ahead before it acts, whatever it learns by."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from copy import copy
 from typing import Any, ClassVar, TypeVar
 
@@ -9,7 +9,6 @@ import numpy as np
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
@@ -38,6 +37,7 @@ from sb3_mcbs.agents.learned_model import (
     set_up_learned_model,
 )
 from sb3_mcbs.agents.planner import Planner
+from sb3_mcbs.agents.resumable import Resumable, Searching
 from sb3_mcbs.agents.roots import EnvironmentStep, Prediction
 from sb3_mcbs.agents.schedule import ScheduleSettings, SearchSchedule
 from sb3_mcbs.agents.value_expansion import (
@@ -54,7 +54,7 @@ from sb3_mcbs.types import take_rows
 SelfMCBS = TypeVar("SelfMCBS", bound="MCBS")
 
 
-class MCBS(SearchAttributes, OffPolicyAlgorithm):
+class MCBS(SearchAttributes, Searching, Resumable):
     """
     Monte Carlo Beam Search for an off-policy agent of SB3: the mixin that stands before it.
 
@@ -71,6 +71,13 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
     docstring of such a class the settings are listed one by one where ``search_settings`` was written.
     """
 
+    #: What neither ``save`` nor an exact checkpoint contains, and why.
+    not_checkpointed: ClassVar[Collection[str]] = {
+        "planner": "its forward model simulates the environments as they are; what it remembers is saved",
+        "_prediction": "of the last step; made anew before it is read",
+        "_states": "of the last step; made anew before it is read",
+        "_checked_env": "a view of the environment",
+    }
     #: Set by ``sb3_mcbs.checkpoints``, which knows the agents, and not the other way round.
     _resume_as: ClassVar[Callable[..., Any]]
     _seed_at_setup: int | None = None
@@ -540,8 +547,17 @@ class MCBS(SearchAttributes, OffPolicyAlgorithm):
         return super().predict(observation, state, episode_start, deterministic)
 
     def _excluded_save_params(self) -> list[str]:
-        transient = ["planner", "_prediction", "_states", "_checked_env", "_noise_without_search"]
-        return [*super()._excluded_save_params(), *transient]
+        # The noise is made anew by learn(), which an exact checkpoint is in the middle of.
+        return [*super()._excluded_save_params(), *MCBS.not_checkpointed, "_noise_without_search"]
+
+    def _search_memory(self) -> dict[str, Any]:
+        assert self.planner is not None
+        return self.planner.memory
+
+    def _go_on_searching(self, memory: dict[str, Any]) -> None:
+        self._follow_settings()  # a callback may have changed them
+        assert self.planner is not None
+        self.planner.memory = memory
 
 
 def _prediction_of(result: SearchResult, envs: Sequence[int]) -> Prediction:

@@ -1,9 +1,10 @@
 """Act with search with any trained agent."""
 
 import operator
+from collections.abc import Collection
 from copy import copy, deepcopy
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -14,6 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from sb3_mcbs.agents.hyperparameters import REMOVED, SETTING_NAMES, refuse_removed, settings_of_preset
 from sb3_mcbs.agents.mcbs import MCBS
 from sb3_mcbs.agents.planner import Planner
+from sb3_mcbs.agents.resumable import Searching
 from sb3_mcbs.search import SearchResult, SearchSettings, with_preset
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 
@@ -21,7 +23,7 @@ from sb3_mcbs.snapshot import SnapshotEnvWrapper
 _HELD = ("model", "vec_env", "settings", "preset")
 
 
-class SearchPolicy:
+class SearchPolicy(Searching):
     """
     A trained agent that looks ahead before it acts, with SB3's ``predict`` signature.
 
@@ -49,6 +51,12 @@ class SearchPolicy:
     :param search_settings: the fields of :class:`~sb3_mcbs.SearchSettings`; those not given are
         those that the agent trained with, or the preset's, or the defaults
     """
+
+    #: What an exact checkpoint does not contain, and why.
+    not_checkpointed: ClassVar[Collection[str]] = {
+        "planner": "its forward model simulates the environments as they are; what it remembers is saved",
+        "last_result": "of the last step; made anew before it is read",
+    }
 
     def __init__(
         self,
@@ -141,6 +149,13 @@ class SearchPolicy:
         self.planner.remember_actions(self.last_result.actions)
         actions = self.planner.unscale(self.last_result.actions)
         return (actions[0] if is_single else actions), state
+
+    def _search_memory(self) -> dict[str, Any]:
+        return self.planner.memory
+
+    def _go_on_searching(self, memory: dict[str, Any]) -> None:
+        self.planner.follow(self.settings)
+        self.planner.memory = memory
 
     def close(self) -> None:
         """Release the forward model. The agent and the environment stay open."""

@@ -40,17 +40,16 @@ def row_arrays(buffer: ReplayBuffer) -> dict[str, np.ndarray]:
     :param buffer: the replay buffer.
     :return: by name, ``[buffer_size, n_envs, ...]``.
     """
-    arrays = {}
+    arrays: dict[str, Any] = {}
     for name, value in vars(buffer).items():
-        parts = (
-            {f"{name}/{key}": part for key, part in value.items()}
-            if isinstance(value, dict)
-            else {name: value}
+        arrays |= (
+            {f"{name}/{key}": v for key, v in value.items()} if isinstance(value, dict) else {name: value}
         )
-        for part_name, array in parts.items():
-            if isinstance(array, np.ndarray) and array.ndim > 1 and not array.dtype.hasobject:
-                arrays[part_name] = array
-    return {name: array for name, array in arrays.items() if name not in REWRITTEN}
+    return {name: array for name, array in arrays.items() if name not in REWRITTEN and _holds_rows(array)}
+
+
+def _holds_rows(value: Any) -> bool:
+    return isinstance(value, np.ndarray) and value.ndim > 1 and not value.dtype.hasobject
 
 
 def row_attributes(buffer: ReplayBuffer) -> set[str]:

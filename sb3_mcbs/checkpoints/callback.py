@@ -6,8 +6,8 @@ import os
 import signal
 import sys
 import warnings
-from types import FrameType
-from typing import Any
+from collections.abc import Collection
+from typing import Any, ClassVar
 
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -17,7 +17,7 @@ from sb3_mcbs.checkpoints.encoding import in_section
 from sb3_mcbs.checkpoints.errors import CheckpointError
 from sb3_mcbs.checkpoints.files import describe_format
 from sb3_mcbs.checkpoints.interrupts import Interrupts, TrainingInterrupted
-from sb3_mcbs.checkpoints.resumption import SETTINGS, Resumption, pending
+from sb3_mcbs.checkpoints.resume import SETTINGS, run_of
 from sb3_mcbs.checkpoints.settings import circumstances, describe_agent, describe_vec_env, inexact
 from sb3_mcbs.checkpoints.state import RunState
 from sb3_mcbs.checkpoints.store import Store
@@ -49,17 +49,13 @@ class ExactCheckpointCallback(BaseCallback):
     :param verbose: Verbosity level: 0 for no output, 1 for a line per checkpoint
     """
 
-    #: Made anew when training begins.
-    not_checkpointed: tuple[str, ...] = (
-        "store",
-        "_run",
-        "_interrupts",
-        "_settings",
-        "_vec_env",
-        "_parts",
-        "_begun",
-        "path",
-    )
+    not_checkpointed: ClassVar[Collection[str]] = {
+        "path": "where to write is not for a checkpoint to decide",
+        **dict.fromkeys(
+            ("store", "_run", "_interrupts", "_settings", "_vec_env", "_parts", "_begun"),
+            "made anew when training begins",
+        ),
+    }
 
     def __init__(
         self, save_freq: int, path: str | os.PathLike[str] | None = None, keep_last: int = 2, verbose: int = 0
@@ -78,7 +74,7 @@ class ExactCheckpointCallback(BaseCallback):
         self._parts: list[dict[str, Any]] = []
         self._begun = False
         self._run: RunState | None = None
-        self._interrupts = Interrupts(self._is_training)
+        self._interrupts = Interrupts()
 
     def _init_callback(self) -> None:
         self._check_place()
@@ -109,17 +105,16 @@ class ExactCheckpointCallback(BaseCallback):
             )
 
     def _is_resumed_here(self) -> bool:
-        resumption = pending(self.model)
-        return resumption is not None and resumption.store.folder.resolve() == self.store.folder.resolve()
+        stopped = run_of(self.model)
+        return stopped is not None and stopped.store.folder.resolve() == self.store.folder.resolve()
 
     def _on_training_start(self) -> None:
         self._check_place()
         self._run = None  # there still if the last call of learn() was stopped
 
     def _on_rollout_start(self) -> None:
-        assert isinstance(self.model, OffPolicyAlgorithm)
         if self._run is None:
-            self._begin(self.model)
+            self._begin()
         self._count_rows()
         stopped_by = self._interrupts.received
         if self.num_timesteps >= self._next_save or stopped_by is not None:
@@ -132,42 +127,46 @@ class ExactCheckpointCallback(BaseCallback):
         return True
 
     def _on_training_end(self) -> None:
-        assert isinstance(self.model, OffPolicyAlgorithm)
-        if pending(self.model) is not None:
-            self._begin(self.model)
+        if run_of(self.model) is not None:
+            self._begin()
         stopped_by = self._interrupts.received
         if self._run is not None and stopped_by is not None:
             # A run that a callback ended stops there again from the checkpoint before.
-            if self.num_timesteps >= self.model._total_timesteps:
+            if self.num_timesteps >= self._agent._total_timesteps:
                 self._count_rows()
                 self._save_or_warn()
             self._stop(stopped_by)
         self._interrupts.end()
         self._run = None
 
-    def _begin(self, agent: OffPolicyAlgorithm) -> None:
+    @property
+    def _agent(self) -> OffPolicyAlgorithm:
+        assert isinstance(self.model, OffPolicyAlgorithm)
+        return self.model
+
+    def _begin(self) -> None:
         """Take stock of the run, once all of it is there, and continue a saved one if that is wanted."""
+        agent = self._agent
         assert agent.env is not None and agent.replay_buffer is not None
-        root = self.locals["callback"]
-        run = RunState(agent, root)
+        run = RunState(agent, self.locals["callback"])
         run.verify()  # the first checkpoint of this call may be one whose failure is only a warning
         self._run, self._begun = run, True
         self._settings = describe_agent(agent)
         self._vec_env = describe_vec_env(agent.env)
         self._position, self._rows_added = agent.replay_buffer.pos, rows_held(agent.replay_buffer)
         self._n_calls_then, self._next_save, self._parts = self.n_calls, self.num_timesteps, []
-        resumption: Resumption | None = pending(agent)
-        if resumption is not None:
+        stopped = run_of(agent)
+        if stopped is not None:
             resumed_here = self._is_resumed_here()
-            resumption.carry_out(agent, self._run, self._settings)
+            stopped.put_back(agent, run, self._settings)
             if resumed_here:
-                self._parts = resumption.checkpoint.manifest["rows"]
+                self._parts = stopped.checkpoint.manifest["rows"]
             (self.store.folder / MARK).unlink(missing_ok=True)
-        self._interrupts.begin(self._run.worker_environments)
+        self._interrupts.begin(agent, run.in_workers)
 
     def _count_rows(self) -> None:
-        assert isinstance(self.model, OffPolicyAlgorithm) and self.model.replay_buffer is not None
-        buffer, steps = self.model.replay_buffer, self.n_calls - self._n_calls_then
+        buffer, steps = self._agent.replay_buffer, self.n_calls - self._n_calls_then
+        assert buffer is not None
         self._rows_added += added_rows(buffer, self._position, steps)
         self._position, self._n_calls_then = buffer.pos, self.n_calls
 
@@ -190,11 +189,9 @@ class ExactCheckpointCallback(BaseCallback):
             warnings.warn(message, stacklevel=2)
 
     def _save(self) -> None:
-        agent = self.model
-        assert isinstance(agent, OffPolicyAlgorithm) and agent.replay_buffer is not None
-        assert self._run is not None
-        captured = self._run.capture()
-        buffer = agent.replay_buffer
+        agent, buffer = self._agent, self._agent.replay_buffer
+        assert self._run is not None and buffer is not None
+        state = self._run.capture()
         oldest = self._rows_added - rows_held(buffer)
         parts = [part for part in self._parts if part["end"] >= oldest and part["end"] <= self._rows_added]
         if not all(self.store.has_rows(part) for part in parts):
@@ -204,8 +201,8 @@ class ExactCheckpointCallback(BaseCallback):
             rows = read_rows(buffer, first, self._rows_added)
             parts.append(self.store.write_rows(first, self._rows_added, rows))
         manifest = {**self._describe(agent), "rows": parts}
-        arrays = {**captured.arrays, **in_section(SETTINGS, self._settings.arrays)}
-        self.store.write(self.num_timesteps, manifest, captured.json, arrays)
+        state.arrays.update(in_section(SETTINGS, self._settings.arrays))
+        self.store.write(self.num_timesteps, manifest, state)
         self._parts = parts
         self.store.clean(self.keep_last, self.num_timesteps)
         if self.verbose >= 1:
@@ -234,10 +231,3 @@ class ExactCheckpointCallback(BaseCallback):
         self._interrupts.end()
         print(f"Stopped by {mark['signal']} at {self.num_timesteps} steps.", file=sys.stderr)
         raise TrainingInterrupted(signum)
-
-    def _is_training(self, frame: FrameType | None) -> bool:
-        while frame is not None:
-            if frame.f_code.co_name == "learn" and frame.f_locals.get("self") is self.model:
-                return True
-            frame = frame.f_back
-        return False

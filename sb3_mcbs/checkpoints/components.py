@@ -1,4 +1,4 @@
-"""What a run consists of, and which of its attributes are not state, each with the reason."""
+"""What a run consists of, and which of its attributes are not state."""
 
 import os
 import re
@@ -24,23 +24,12 @@ _FILE = "an open file; its content is saved"
 #: The end of a word in the names of attributes that say where something is written.
 _PLACE = re.compile(r"(path|dir|directory|folder|file|filename|prefix)(_|$)")
 
-#: Class (and those derived from it) -> attribute -> why it is neither saved nor restored.
+#: Class of SB3 or torch (and those derived from it) -> attribute -> why it is neither saved nor restored.
+#: This package's classes say so themselves, as ``not_checkpointed``; so may those of the user.
 NOT_STATE: dict[type, dict[str, str]] = {
     BaseAlgorithm: {
         "start_time": "the time that was used so far is saved instead",
-        "planner": "its forward model simulates the environments as they are; what it noticed is saved",
-        "_prediction": "of the last step; made anew before it is read",
-        "_states": "of the last step; made anew before it is read",
-        "_reasons_said": "what the user of this process was told",
-        "_checked_env": "a view of the environment",
-        "_resumption": "only there until a run was resumed",
-        "_setup_learn": "only replaced until a run was resumed",
-        "_excluded_save_params": "only replaced until a run was resumed",
         "tensorboard_log": "a setting, which was checked when the run was resumed",
-    },
-    SearchPolicy: {
-        "planner": "its forward model simulates the environments as they are; what it noticed is saved",
-        "last_result": "of the last step; made anew before it is read",
     },
     nn.Module: {
         "_parameters": "saved as state_dict",
@@ -96,8 +85,9 @@ def not_state_of(component: Any, saved: Iterable[str] = ()) -> frozenset[str]:
         names |= row_attributes(component)
     if isinstance(component, BaseCallback | VecEnv):
         names |= {name for name in {*vars(component), *saved} if _is_place(component, name)}
-    own = getattr(type(component), "not_checkpointed", ())
-    return frozenset(names | set(own))
+    for cls in type(component).__mro__:
+        names |= set(vars(cls).get("not_checkpointed", ()))
+    return frozenset(names)
 
 
 def _is_place(component: Any, name: str) -> bool:
@@ -126,11 +116,20 @@ def components(agent: OffPolicyAlgorithm, callback: BaseCallback) -> dict[str, A
         found[name] = each
         if isinstance(each.model, SearchPolicy):
             found[f"{name}.model"] = each.model
-    for name, vec_env in list(vec_envs(agent, found)):
+    # The agent's environment, and those that callbacks evaluate in.
+    vec_envs = {"agent.env": agent.env}
+    for name, part in found.items():
+        if isinstance(part, BaseCallback | SearchPolicy):
+            held = vars(part).items()
+            vec_envs |= {
+                f"{name}.{attribute}": value for attribute, value in held if isinstance(value, VecEnv)
+            }
+    for name, vec_env in vec_envs.items():
+        assert vec_env is not None
         for depth, layer in enumerate(layers_of(vec_env)):
             found[f"{name}.layers[{depth}]"] = layer
-    seen: set[int] = set()
-    return {name: part for name, part in found.items() if not (id(part) in seen or seen.add(id(part)))}  # type: ignore[func-returns-value]
+    first_names = {id(part): name for name, part in reversed(found.items())}
+    return {name: found[name] for name in found if first_names[id(found[name])] == name}
 
 
 def callbacks(name: str, callback: BaseCallback) -> Iterator[tuple[str, BaseCallback]]:
@@ -149,21 +148,6 @@ def callbacks(name: str, callback: BaseCallback) -> Iterator[tuple[str, BaseCall
             for index, item in enumerate(value):
                 if isinstance(item, BaseCallback):
                     yield from callbacks(f"{name}.{attribute}[{index}]", item)
-
-
-def vec_envs(agent: OffPolicyAlgorithm, found: dict[str, Any]) -> Iterator[tuple[str, VecEnv]]:
-    """Find the vectorized environments: the agent's, and those that callbacks evaluate in.
-
-    :param agent: the agent.
-    :param found: components by name.
-    """
-    assert agent.env is not None
-    yield "agent.env", agent.env
-    for name, part in found.items():
-        if isinstance(part, BaseCallback | SearchPolicy):
-            for attribute, value in vars(part).items():
-                if isinstance(value, VecEnv):
-                    yield f"{name}.{attribute}", value
 
 
 def layers_of(vec_env: VecEnv) -> Iterator[VecEnv]:

@@ -8,7 +8,6 @@ the reader hands in, because its own agent and environments use them.
 import enum
 import functools
 import hashlib
-import json
 import math
 import pathlib
 import re
@@ -41,15 +40,8 @@ class Encoded(NamedTuple):
     arrays: dict[str, np.ndarray]
 
 
-class Codec(NamedTuple):
-    """How the objects of a class become plain data and back."""
-
-    to_data: Callable[[Any], Any]
-    from_data: Callable[[Any], Any]
-
-
-_codecs: dict[type, Codec] = {}
-_by_name: dict[str, type] = {}
+#: Name of a class -> the functions that turn its objects into plain data and back.
+_registered: dict[str, tuple[Callable[[Any], Any], Callable[[Any], Any]]] = {}
 
 
 def register_state(cls: type, to_data: Callable[[Any], Any], from_data: Callable[[Any], Any]) -> None:
@@ -62,16 +54,15 @@ def register_state(cls: type, to_data: Callable[[Any], Any], from_data: Callable
     """
     if not isinstance(cls, type) or not callable(to_data) or not callable(from_data):
         raise TypeError("register_state takes a class and two functions.")
-    _codecs[cls] = Codec(to_data, from_data)
-    _by_name[class_name(cls)] = cls
+    _registered[class_name(cls)] = to_data, from_data
 
 
-def codec_of(cls: type) -> Codec | None:
-    """Return what was registered for a class.
+def is_registered(cls: type) -> bool:
+    """Whether :func:`register_state` was called for a class.
 
     :param cls: the class.
     """
-    return _codecs.get(cls)
+    return class_name(cls) in _registered
 
 
 def in_section(section: str, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -135,9 +126,9 @@ class Encoder:
         return self._encode_rare(value, cls)
 
     def _encode_rare(self, value: Any, cls: type) -> Any:
-        codec = _codecs.get(cls)
-        if codec is not None:
-            return {"registered": [class_name(cls), self.encode(codec.to_data(value))]}
+        if is_registered(cls):
+            to_data, _ = _registered[class_name(cls)]
+            return {"registered": [class_name(cls), self.encode(to_data(value))]}
         if isinstance(value, np.generic) and value.dtype.kind in _PLAIN_DTYPES:
             return {"scalar": self._array(np.asarray(value))}
         if isinstance(value, np.dtype):
@@ -235,13 +226,13 @@ class Decoder:
 
     def _registered(self, content: Any) -> Any:
         name, data = content
-        cls = _by_name.get(name)
-        if cls is None:
+        if name not in _registered:
             raise CheckpointError(
                 f"The checkpoint holds a {name}, which is not registered here. Import what calls "
                 "register_state for it before you resume."
             )
-        return _codecs[cls].from_data(self.decode(data))
+        _, from_data = _registered[name]
+        return from_data(self.decode(data))
 
     def _named(self, name: str) -> Any:
         if name not in self._names:
@@ -294,8 +285,7 @@ def name_of(value: Any) -> str:
         return f"compiled {getattr(value, '__module__', None)}.{qualname}"
     raise CheckpointError(
         f"A {class_name(type(value))} cannot be written as data. Register a pair of functions for its "
-        "class with "
-        "sb3_mcbs.checkpoints.register_state."
+        "class with sb3_mcbs.checkpoints.register_state."
     )
 
 
@@ -313,14 +303,6 @@ def _checked_dtype(name: str) -> np.dtype:
     dtype = np.dtype(str(name))
     _plain_dtype(dtype)
     return dtype
-
-
-def dumps(data: Any) -> bytes:
-    """Write JSON.
-
-    :param data: without NaN and infinities.
-    """
-    return json.dumps(data, allow_nan=False, separators=(",", ":")).encode()
 
 
 register_state(th.device, str, lambda data: th.device(str(data)))

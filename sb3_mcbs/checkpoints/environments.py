@@ -1,5 +1,6 @@
 """One environment's whole state as data. These functions run where the environment lives."""
 
+import functools
 import random
 from collections.abc import Iterator
 from typing import Any
@@ -11,7 +12,7 @@ from stable_baselines3.common.monitor import Monitor
 
 from sb3_mcbs.checkpoints.encoding import Decoder, Encoded, Encoder, register_state
 from sb3_mcbs.checkpoints.errors import CheckpointError
-from sb3_mcbs.checkpoints.files import read_written, results_file, write_again
+from sb3_mcbs.checkpoints.files import file_of, read_written, write_again
 from sb3_mcbs.checkpoints.names import known_names
 from sb3_mcbs.snapshot import Snapshot, SnapshotEnvWrapper, SnapshotError
 from sb3_mcbs.snapshot.pairing import CapturedLayer
@@ -44,28 +45,27 @@ def set_generators(states: _Generators) -> None:
         th.cuda.set_rng_state_all([th.from_numpy(state) for state in states["cuda"]])
 
 
-def capture_environment(wrapper: SnapshotEnvWrapper, with_generators: bool) -> Encoded:
+def capture_environment(
+    wrapper: SnapshotEnvWrapper, with_generators: bool, encoder: Encoder | None = None
+) -> Encoded:
     """Read an environment's state.
 
     :param wrapper: the environment.
     :param with_generators: whether the process's global generators belong to it, as in a worker.
+    :param encoder: a new one, if the names of the classes that the environment uses are wanted.
     :raises SnapshotUnsupportedError: if part of it cannot be captured.
     :raises CheckpointError: if part of it cannot be written as data.
     """
-    return _encode(wrapper, with_generators)[1]
-
-
-def _encode(wrapper: SnapshotEnvWrapper, with_generators: bool) -> tuple[Encoder, Encoded]:
-    snapshot, encoder = wrapper.snapshot(), Encoder()
+    snapshot, encoder = wrapper.snapshot(), encoder or Encoder()
     content = {
         "layers": [tuple(layer) for layer in snapshot.layers],
         "spaces": snapshot.spaces,
         "last_observation": snapshot.last_observation,
-        "monitors": [(monitor.t_start, _written(monitor)) for monitor in _monitors(wrapper)],
+        "monitors": [(monitor.t_start, read_written(file_of(monitor))) for monitor in monitors_of(wrapper)],
         "generators": read_generators() if with_generators else None,
     }
     data = {"nodes": encoder.encode_nodes(snapshot.nodes), "content": encoder.encode(content)}
-    return encoder, Encoded(data, encoder.arrays)
+    return Encoded(data, encoder.arrays)
 
 
 def restore_environment(
@@ -82,8 +82,9 @@ def restore_environment(
     """
     if wrapper.last_observation is None:
         wrapper.reset()  # what an environment makes in its first reset tells more of the classes it uses
-    names = {**known_names(classes), **_encode(wrapper, False)[0].names}
-    decoder = Decoder(encoded.arrays, names)
+    used_here = Encoder()
+    capture_environment(wrapper, False, used_here)
+    decoder = Decoder(encoded.arrays, {**known_names(classes), **used_here.names})
     nodes = decoder.decode_nodes(encoded.json["nodes"])
     content = decoder.decode(encoded.json["content"])
     layers = tuple(CapturedLayer(*layer) for layer in content["layers"])
@@ -93,7 +94,7 @@ def restore_environment(
         raise CheckpointError(
             f"The environment is not made as the one of the checkpoint: {error} Pass an env that is."
         ) from error
-    for monitor, (t_start, _) in zip(_monitors(wrapper), content["monitors"], strict=False):
+    for monitor, (t_start, _) in zip(monitors_of(wrapper), content["monitors"], strict=False):
         monitor.t_start = t_start
     if content["generators"] is not None:
         set_generators(content["generators"])
@@ -106,86 +107,28 @@ def write_monitor_files(wrapper: SnapshotEnvWrapper, contents: list[np.ndarray |
     :param wrapper: the environment.
     :param contents: from :func:`restore_environment`.
     """
-    for monitor, written in zip(_monitors(wrapper), contents, strict=False):
-        file = results_file(monitor)
-        if file is not None and written is not None:
-            write_again(file, written)
+    for monitor, written in zip(monitors_of(wrapper), contents, strict=False):
+        write_again(file_of(monitor), written)
 
 
-def _monitors(env: gym.Env) -> Iterator[Monitor]:
+def monitors_of(env: gym.Env) -> Iterator[Monitor]:
+    """Find the Monitors around an environment, outermost first.
+
+    :param env: the environment.
+    """
     while isinstance(env, gym.Wrapper):
         if isinstance(env, Monitor):
             yield env
         env = env.env
 
 
-def _written(monitor: Monitor) -> np.ndarray | None:
-    file = results_file(monitor)
-    return None if file is None else read_written(file)
-
-
-def describe_environment(wrapper: SnapshotEnvWrapper) -> dict[str, Any] | None:
-    """Say how to make an environment like this one, if its id and arguments are all that it takes.
-
-    :param wrapper: the environment.
-    :return: id, arguments and its Monitor's; None if it takes more.
-    """
-    spec, monitors = wrapper.spec, list(_monitors(wrapper))
-    if spec is None or len(monitors) > 1:
-        return None
-    # Wrappers that Gymnasium adds by itself are not among these.
-    own = [f"{cls.__module__}:{cls.__name__}" for cls in (Monitor, SnapshotEnvWrapper)]
-    if any(wrapper_spec.entry_point not in own for wrapper_spec in spec.additional_wrappers):
-        return None
-    arguments = {key: value for key, value in spec.kwargs.items() if key != "render_mode"}
-    description: dict[str, Any] = {
-        "id": spec.id,
-        "arguments": arguments,
-        "max_episode_steps": spec.max_episode_steps,
-        "verify": wrapper.verifies,
-        "monitor": None,
-    }
-    if monitors:
-        file = results_file(monitors[0])
-        description["monitor"] = {
-            "filename": None if file is None else file.name,
-            "allow_early_resets": monitors[0].allow_early_resets,
-            "reset_keywords": list(monitors[0].reset_keywords),
-            "info_keywords": list(monitors[0].info_keywords),
-        }
-    return description if _is_json(arguments) else None
-
-
-def _is_json(value: Any) -> bool:
-    if isinstance(value, dict):
-        return all(type(key) is str and _is_json(item) for key, item in value.items())
-    if isinstance(value, list):
-        return all(_is_json(item) for item in value)
-    return value is None or type(value) in (bool, int, float, str)
-
-
-def make_environment(description: dict[str, Any]) -> SnapshotEnvWrapper:
-    """Make an environment that :func:`describe_environment` described.
-
-    :param description: its id is looked up among the environments that are registered here.
-    """
-    limit = description["max_episode_steps"]
-    registered = gym.spec(description["id"]).max_episode_steps
-    arguments = dict(description["arguments"])
-    if limit != registered:
-        arguments["max_episode_steps"] = -1 if limit is None else limit
-    env = gym.make(description["id"], **arguments)
-    if description["monitor"] is not None:
-        monitor = description["monitor"]
-        env = Monitor(
-            env,
-            monitor["filename"],
-            allow_early_resets=monitor["allow_early_resets"],
-            reset_keywords=tuple(monitor["reset_keywords"]),
-            info_keywords=tuple(monitor["info_keywords"]),
-            override_existing=False,  # emptied only when the run goes on
-        )
-    return SnapshotEnvWrapper(env, verify=description.get("verify", True))
+def _with_state(cls: Any, state: dict[str, Any]) -> Any:
+    made = cls.__new__(cls)
+    if hasattr(made, "__setstate__"):
+        made.__setstate__(state)
+    else:
+        vars(made).update(state)
+    return made
 
 
 register_state(Episode, tuple, lambda data: Episode(*data))
@@ -194,16 +137,5 @@ try:
 except ImportError:  # MuJoCo is an optional part of Gymnasium
     pass
 else:
-
-    def _data_state(data: dict[str, Any]) -> DataState:
-        state = DataState.__new__(DataState)
-        state.__setstate__(data)
-        return state
-
-    def _model_state(data: dict[str, Any]) -> ModelState:
-        state = ModelState.__new__(ModelState)
-        vars(state).update(data)
-        return state
-
-    register_state(DataState, DataState.__getstate__, _data_state)
-    register_state(ModelState, lambda state: dict(vars(state)), _model_state)
+    for cls in (DataState, ModelState):
+        register_state(cls, cls.__getstate__, functools.partial(_with_state, cls))

@@ -21,8 +21,12 @@ from stable_baselines3.common.vec_env import VecMonitor
 
 from sb3_mcbs.checkpoints.errors import CheckpointError
 
-_FILE_FORMATS: dict[str, Any] = {"log": HumanOutputFormat, "json": JSONOutputFormat, "csv": CSVOutputFormat}
-_SUFFIXES = {"log": (".txt", ".log"), "json": (".json", ".jsonl"), "csv": (".csv",)}
+#: Kind of a log file -> what writes it, and how its name ends.
+_FILE_FORMATS: dict[str, tuple[Any, tuple[str, ...]]] = {
+    "log": (HumanOutputFormat, (".txt", ".log")),
+    "json": (JSONOutputFormat, (".json", ".jsonl")),
+    "csv": (CSVOutputFormat, (".csv",)),
+}
 
 
 class Unopened(io.StringIO):
@@ -38,37 +42,33 @@ class Unopened(io.StringIO):
         self.name = path
 
 
-def read_written(handle: Any) -> np.ndarray:
+def read_written(handle: IO[Any] | None) -> np.ndarray | None:
     """Return what a file that is open for writing holds so far.
 
-    :param handle: the open file.
+    :param handle: the open file, if there is one.
     :return: its bytes, ``[size]`` uint8.
     """
+    if handle is None:
+        return None
     if isinstance(handle, Unopened):
         return np.empty(0, np.uint8)
     handle.flush()
     return np.fromfile(handle.name, np.uint8)
 
 
-def write_again(handle: Any, content: np.ndarray) -> None:
+def write_again(handle: Any, content: np.ndarray | None) -> None:
     """Make a file that is open for writing hold what it held, and go on from there.
 
-    :param handle: the open file.
+    :param handle: the open file, if there is one.
     :param content: from :func:`read_written`.
     """
+    if handle is None or content is None:
+        return
     text = content.tobytes().decode(handle.encoding)
     handle.seek(0)
     handle.truncate()
     handle.write(text)
     handle.flush()
-
-
-def results_file(monitor: Monitor | VecMonitor) -> IO[Any] | None:
-    """Return the file that a monitor writes episodes into, if it does.
-
-    :param monitor: SB3's ``Monitor`` or ``VecMonitor``.
-    """
-    return None if monitor.results_writer is None else monitor.results_writer.file_handler
 
 
 def describe_format(output_format: Any) -> tuple[str, str | None]:
@@ -80,7 +80,7 @@ def describe_format(output_format: Any) -> tuple[str, str | None]:
     """
     if type(output_format) is TensorBoardOutputFormat:
         return "tensorboard", os.path.abspath(output_format.writer.log_dir)
-    for kind, cls in _FILE_FORMATS.items():
+    for kind, (cls, _) in _FILE_FORMATS.items():
         if type(output_format) is cls:
             if kind == "log" and not output_format.own_file:
                 return "stdout", None
@@ -91,13 +91,17 @@ def describe_format(output_format: Any) -> tuple[str, str | None]:
     )
 
 
-def file_of(output_format: Any) -> IO[Any] | None:
-    """Return the file that an output format writes line by line, if it does.
+def file_of(part: Any) -> IO[Any] | None:
+    """Return the file that a part of a run writes line by line, if it does.
 
-    :param output_format: one of SB3's.
+    :param part: an output format of the logger, a ``Monitor`` or ``VecMonitor``, or anything else.
     """
-    kind, path = describe_format(output_format)
-    return output_format.file if path is not None and kind != "tensorboard" else None
+    if isinstance(part, Monitor | VecMonitor):
+        return None if part.results_writer is None else part.results_writer.file_handler
+    if not isinstance(part, KVWriter):
+        return None
+    kind, path = describe_format(part)
+    return part.file if path is not None and kind != "tensorboard" else None  # type: ignore[attr-defined]
 
 
 def make_logger(
@@ -137,9 +141,10 @@ def _make_format(kind: str, path: str | None, purge_step: int, roots: list[Path]
         output_format.writer = _make_writer(path, purge_step)
         output_format._is_closed = False
         return output_format
-    if kind not in _FILE_FORMATS or not path.endswith(_SUFFIXES[kind]):
+    make, suffixes = _FILE_FORMATS.get(kind, (None, ()))
+    if not path.endswith(suffixes):
         raise CheckpointError(f"The checkpoint names {path!r} as a log file of kind {kind!r}.")
-    output_format = _FILE_FORMATS[kind](os.devnull)
+    output_format = make(os.devnull)
     output_format.file.close()
     output_format.file = Unopened(path)
     return output_format

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import torch as th
 
-from sb3_mcbs.checkpoints.encoding import CALLED, codec_of
+from sb3_mcbs.checkpoints.encoding import CALLED, is_registered
 from sb3_mcbs.snapshot import SnapshotMismatchError, SnapshotUnsupportedError
 from sb3_mcbs.snapshot.arrays import ArrayHandler
 from sb3_mcbs.snapshot.handlers import HANDLERS as ENVIRONMENT_HANDLERS
@@ -145,7 +145,7 @@ def handler_of(obj: Any) -> TypeHandler | None:
         return _OWN["optimizer"]
     if isinstance(obj, th.distributions.Distribution):
         return HANDLERS["constant"]  # made anew from the networks whenever it is needed
-    if codec_of(cls) is not None:
+    if is_registered(cls):
         return _OWN["registered"]
     if issubclass(cls, tuple) and hasattr(cls, "_fields"):
         return _OWN["namedtuple"]

@@ -4,10 +4,10 @@ import os
 import signal
 import threading
 import weakref
-from collections.abc import Callable
 from types import FrameType
 from typing import Any
 
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
@@ -34,22 +34,21 @@ class Interrupts:
 
     Worker processes ignore both signals meanwhile: Ctrl-C reaches the whole process group, and a checkpoint
     needs them. They end when this process does.
-
-    :param is_training: given the frame that was interrupted, whether somebody will look at the note.
     """
 
-    def __init__(self, is_training: Callable[[FrameType | None], bool]) -> None:
+    def __init__(self) -> None:
         self.received: int | None = None
-        self._is_training = is_training
+        self._agent: OffPolicyAlgorithm | None = None
         self._previous: dict[int, Any] = {}
         self._workers: list[SubprocVecEnv] = []
 
-    def begin(self, workers: list[SubprocVecEnv]) -> None:
+    def begin(self, agent: OffPolicyAlgorithm, workers: list[SubprocVecEnv]) -> None:
         """Take over the signals, in the main thread; elsewhere Python allows no handlers.
 
+        :param agent: that learns.
         :param workers: environments in worker processes.
         """
-        self.received = None
+        self.received, self._agent = None, agent
         self._give_back()  # not done yet if the last training ended in an error
         if threading.current_thread() is not threading.main_thread():
             return
@@ -75,9 +74,8 @@ class Interrupts:
         self._previous = {}
 
     def _note(self, signum: int, frame: FrameType | None) -> None:
-        training = self._is_training(frame)
         self._give_back()
-        if not training:
+        if not _is_learning(self._agent, frame):
             os.kill(os.getpid(), signum)
             return
         self.received = signum
@@ -86,6 +84,15 @@ class Interrupts:
             "stops. Once more to stop at once.",
             flush=True,
         )
+
+
+def _is_learning(agent: OffPolicyAlgorithm | None, frame: FrameType | None) -> bool:
+    """Whether somebody will look at the note: no callback is told of a ``learn`` that an error has ended."""
+    while frame is not None:
+        if frame.f_code.co_name == "learn" and frame.f_locals.get("self") is agent:
+            return True
+        frame = frame.f_back
+    return False
 
 
 def _ignore_signals(wrapper: SnapshotEnvWrapper) -> None:

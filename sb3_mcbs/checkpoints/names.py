@@ -21,15 +21,12 @@ from sb3_mcbs.agents.registry import ALGORITHMS
 from sb3_mcbs.checkpoints.encoding import name_of
 from sb3_mcbs.snapshot.functions import FunctionName
 
-#: Agents whose whole state is known.
-AGENTS = tuple(ALGORITHMS.values())
-
 _CLASSES: tuple[type, ...] = (
     np.float32, np.float64, np.int32, np.int64, np.uint8, np.bool_,
     bool, int, float, str, bytes, list, tuple, dict, set, frozenset, deque, OrderedDict, defaultdict,
     random.Random, np.random.Generator, np.random.RandomState, np.random.PCG64, np.random.MT19937,
     np.random.PCG64DXSM, np.random.Philox, np.random.SFC64,
-    *AGENTS,
+    *ALGORITHMS.values(),
     buffers.ReplayBuffer, buffers.NStepReplayBuffer, buffers.DictReplayBuffer, HerReplayBuffer,
     GoalSelectionStrategy, type_aliases.TrainFreq, type_aliases.TrainFrequencyUnit,
     noise.NormalActionNoise, noise.OrnsteinUhlenbeckActionNoise, noise.VectorizedActionNoise,
@@ -39,8 +36,6 @@ _CLASSES: tuple[type, ...] = (
     th.nn.ReLU, th.nn.Tanh, th.nn.ELU, th.nn.LeakyReLU, th.nn.GELU, th.nn.SiLU, th.nn.Sigmoid, th.nn.Softplus,
     th.optim.Adam, th.optim.AdamW, th.optim.SGD, th.optim.RMSprop,
 )  # fmt: skip
-#: RL Zoo is not imported for this; its class is only accepted where somebody did.
-_IF_IMPORTED = (("rl_zoo3.utils", "SimpleLinearSchedule"),)
 
 
 @functools.cache
@@ -61,11 +56,8 @@ def known_names(classes: Iterable[Any] = ()) -> dict[str, Any]:
     :param classes: classes and functions that the caller trusts, besides.
     """
     names = dict(_own_names())
-    for module, name in _IF_IMPORTED:
-        found = getattr(sys.modules.get(module), name, None)
-        if found is not None:
-            names[name_of(found)] = found
-    for trusted in classes:
+    zoos = getattr(sys.modules.get("rl_zoo3.utils"), "SimpleLinearSchedule", None)  # not imported for this
+    for trusted in (*classes, *([] if zoos is None else [zoos])):
         is_function = type(trusted) is type(known_names)
         names[name_of(FunctionName(trusted) if is_function else trusted)] = trusted
     return names

@@ -3,6 +3,7 @@
 import functools
 import inspect
 import platform
+from collections.abc import Iterable
 from importlib.metadata import version
 from typing import Any
 
@@ -10,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import NStepReplayBuffer
-from stable_baselines3.common.monitor import ResultsWriter
+from stable_baselines3.common.monitor import Monitor, ResultsWriter
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import (
@@ -22,14 +23,15 @@ from stable_baselines3.common.vec_env import (
     VecTransposeImage,
 )
 
+from sb3_mcbs.agents.hyperparameters import REMOVED
 from sb3_mcbs.agents.observation_pipeline import snapshot_environments
 from sb3_mcbs.checkpoints.components import layers_of
 from sb3_mcbs.checkpoints.encoding import Decoder, Encoded, Encoder, name_of
-from sb3_mcbs.checkpoints.environments import describe_environment, make_environment
+from sb3_mcbs.checkpoints.environments import monitors_of
 from sb3_mcbs.checkpoints.errors import CheckpointError
-from sb3_mcbs.checkpoints.files import results_file
+from sb3_mcbs.checkpoints.files import file_of
 from sb3_mcbs.checkpoints.handlers import HANDLERS, handler_of
-from sb3_mcbs.snapshot import SnapshotUnsupportedError
+from sb3_mcbs.snapshot import SnapshotEnvWrapper, SnapshotUnsupportedError
 from sb3_mcbs.snapshot.object_graph import Capture, Restore
 
 #: Parameters of constructors that are kept under another name.
@@ -95,6 +97,7 @@ def make_agent(encoded: Encoded, names: dict[str, Any], env: GymEnv) -> OffPolic
     cls = decoder.decode({"name": encoded.json["class"]})
     if not (isinstance(cls, type) and issubclass(cls, OffPolicyAlgorithm)):
         raise CheckpointError(f"The checkpoint names {cls!r} as the class of its agent.")
+    _refuse_removed(encoded.json["settings"], inspect.signature(cls.__init__).parameters)
     restore = Restore(decoder.decode_nodes(encoded.json["nodes"]), HANDLERS, [], "restore")
     settings = {name: restore(decoder.decode(value)) for name, value in encoded.json["settings"].items()}
     restore.commit()
@@ -115,7 +118,7 @@ def describe_vec_env(vec_env: VecEnv) -> dict[str, Any] | None:
         if type(layer) is VecNormalize:
             layers.append(["VecNormalize", {name: getattr(layer, name) for name in _NORMALIZE}])
         elif type(layer) is VecMonitor:
-            file = results_file(layer)
+            file = file_of(layer)
             filename = None if file is None else file.name
             layers.append(["VecMonitor", {"filename": filename, "info_keywords": list(layer.info_keywords)}])
         elif type(layer) is not VecTransposeImage:  # which SB3 adds by itself
@@ -132,7 +135,7 @@ def make_vec_env(description: dict[str, Any]) -> VecEnv:
 
     :param description: from :func:`describe_vec_env`.
     """
-    makers = [_Maker(environment) for environment in description["environments"]]
+    makers = [functools.partial(make_environment, each) for each in description["environments"]]
     for environment in description["environments"]:
         if environment["id"] not in gym.registry:
             raise CheckpointError(
@@ -151,16 +154,6 @@ def make_vec_env(description: dict[str, Any]) -> VecEnv:
     return vec_env
 
 
-class _Maker:
-    """Makes one environment, in a worker too."""
-
-    def __init__(self, description: dict[str, Any]) -> None:
-        self._description = description
-
-    def __call__(self) -> Any:
-        return make_environment(self._description)
-
-
 def log_files(description: dict[str, Any]) -> list[str]:
     """Return the files that a vectorized environment would write.
 
@@ -170,6 +163,70 @@ def log_files(description: dict[str, Any]) -> list[str]:
     names = [monitor["filename"] for monitor in monitors if monitor is not None]
     names += [arguments["filename"] for name, arguments in description["layers"] if name == "VecMonitor"]
     return [name for name in names if name is not None]
+
+
+def describe_environment(wrapper: SnapshotEnvWrapper) -> dict[str, Any] | None:
+    """Say how to make an environment like this one, if its id and arguments are all that it takes.
+
+    :param wrapper: the environment.
+    :return: id, arguments and its Monitor's; None if it takes more.
+    """
+    spec, monitors = wrapper.spec, list(monitors_of(wrapper))
+    if spec is None or len(monitors) > 1:
+        return None
+    # Wrappers that Gymnasium adds by itself are not among these.
+    own = [f"{cls.__module__}:{cls.__name__}" for cls in (Monitor, SnapshotEnvWrapper)]
+    if any(wrapper_spec.entry_point not in own for wrapper_spec in spec.additional_wrappers):
+        return None
+    arguments = {key: value for key, value in spec.kwargs.items() if key != "render_mode"}
+    description: dict[str, Any] = {
+        "id": spec.id,
+        "arguments": arguments,
+        "max_episode_steps": spec.max_episode_steps,
+        "verify": wrapper.verifies,
+        "monitor": None,
+    }
+    if monitors:
+        file = file_of(monitors[0])
+        description["monitor"] = {
+            "filename": None if file is None else file.name,
+            "allow_early_resets": monitors[0].allow_early_resets,
+            "reset_keywords": list(monitors[0].reset_keywords),
+            "info_keywords": list(monitors[0].info_keywords),
+        }
+    return description if _is_json(arguments) else None
+
+
+def _is_json(value: Any) -> bool:
+    if isinstance(value, dict):
+        return all(type(key) is str and _is_json(item) for key, item in value.items())
+    if isinstance(value, list):
+        return all(_is_json(item) for item in value)
+    return value is None or type(value) in (bool, int, float, str)
+
+
+def make_environment(description: dict[str, Any]) -> SnapshotEnvWrapper:
+    """Make an environment that :func:`describe_environment` described.
+
+    :param description: its id is looked up among the environments that are registered here.
+    """
+    limit = description["max_episode_steps"]
+    registered = gym.spec(description["id"]).max_episode_steps
+    arguments = dict(description["arguments"])
+    if limit != registered:
+        arguments["max_episode_steps"] = -1 if limit is None else limit
+    env = gym.make(description["id"], **arguments)
+    if description["monitor"] is not None:
+        monitor = description["monitor"]
+        env = Monitor(
+            env,
+            monitor["filename"],
+            allow_early_resets=monitor["allow_early_resets"],
+            reset_keywords=tuple(monitor["reset_keywords"]),
+            info_keywords=tuple(monitor["info_keywords"]),
+            override_existing=False,  # emptied only when the run goes on
+        )
+    return SnapshotEnvWrapper(env, verify=description.get("verify", True))
 
 
 def circumstances(agent: OffPolicyAlgorithm) -> dict[str, Any]:
@@ -209,27 +266,36 @@ def inexact(agent: OffPolicyAlgorithm) -> list[str]:
     return reasons
 
 
-def check_settings(settings: Encoded, ours: Encoded) -> None:
+def check_settings(saved: Encoded, ours: Encoded) -> None:
     """Refuse to continue a run with an agent that was made with other settings.
 
-    :param settings: those of the checkpoint.
+    :param saved: those of the checkpoint.
     :param ours: the agent's own.
     :raises CheckpointError: names the settings that differ.
     """
-    theirs_json, ours_json = settings.json, ours.json
-    if theirs_json["class"] != ours_json["class"]:
+    if saved.json["class"] != ours.json["class"]:
         raise CheckpointError(
-            f"The checkpoint is of a {theirs_json['class']}, the agent is a {ours_json['class']}."
+            f"The checkpoint is of a {saved.json['class']}, the agent is a {ours.json['class']}."
         )
-    if theirs_json == ours_json and all(
+    theirs, mine = saved.json["settings"], ours.json["settings"]
+    _refuse_removed(theirs, mine)
+    differ = sorted(name for name in theirs.keys() | mine.keys() if theirs.get(name) != mine.get(name))
+    same_content = saved.json["nodes"] == ours.json["nodes"] and all(
         name in ours.arrays and np.array_equal(array, ours.arrays[name])
-        for name, array in settings.arrays.items()
-    ):
-        return
-    names = sorted(
-        name
-        for name in theirs_json["settings"].keys() | ours_json["settings"].keys()
-        if theirs_json["settings"].get(name) != ours_json["settings"].get(name)
+        for name, array in saved.arrays.items()
     )
-    what = ", ".join(names) if names else "the content of its settings"
-    raise CheckpointError(f"The agent was made with other settings than the run of the checkpoint: {what}.")
+    if differ or not same_content:
+        what = ", ".join(differ) or "the content of its settings"
+        raise CheckpointError(
+            f"The agent was made with other settings than the run of the checkpoint: {what}."
+        )
+
+
+def _refuse_removed(theirs: dict[str, Any], known: Iterable[str]) -> None:
+    """Say more than the constructor would where a run is older than a change of the search's settings."""
+    removed = [f"{name} ({REMOVED[name][1]})" for name in theirs if name in REMOVED and name not in known]
+    if removed:
+        raise CheckpointError(
+            f"The run was made with settings that were removed since then: {', '.join(removed)}. Continue it "
+            "with the version of sb3-mcbs that it was started with."
+        )

@@ -1,19 +1,18 @@
 """The state of a whole run: agent, replay buffer, environments, callbacks and logger, in one graph."""
 
 import time
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import KVWriter
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecMonitor
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvWrapper
 
-from sb3_mcbs.agents import SearchPolicy
-from sb3_mcbs.agents.attributes import SearchAttributes
 from sb3_mcbs.agents.observation_pipeline import snapshot_environments
-from sb3_mcbs.checkpoints.components import components, layers_of, not_state_of
+from sb3_mcbs.agents.resumable import Searching
+from sb3_mcbs.checkpoints.components import components, not_state_of
 from sb3_mcbs.checkpoints.encoding import Decoder, Encoded, Encoder, in_section, of_section
 from sb3_mcbs.checkpoints.environments import (
     capture_environment,
@@ -23,27 +22,16 @@ from sb3_mcbs.checkpoints.environments import (
     write_monitor_files,
 )
 from sb3_mcbs.checkpoints.errors import CheckpointError
-from sb3_mcbs.checkpoints.files import file_of, open_log_files, read_written, results_file, write_again
+from sb3_mcbs.checkpoints.files import file_of, open_log_files, read_written, write_again
 from sb3_mcbs.checkpoints.handlers import HANDLERS, handler_of
 from sb3_mcbs.checkpoints.names import known_names
-from sb3_mcbs.models import Environments, WorkerEnvironments
+from sb3_mcbs.models import WorkerEnvironments
 from sb3_mcbs.snapshot import SnapshotEnvWrapper, SnapshotError, SnapshotUnsupportedError
 from sb3_mcbs.snapshot.attributes import capture_attributes, restore_attributes
 from sb3_mcbs.snapshot.object_graph import Capture, Ref, Restore, class_name
 
 RUN = "run"
 _POLICY = "policy"
-
-
-class Captured(NamedTuple):
-    """The state of a run as data.
-
-    :param json: by section: the run, and each environment.
-    :param arrays: by section and dtype.
-    """
-
-    json: dict[str, Any]
-    arrays: dict[str, np.ndarray]
 
 
 class RunState:
@@ -59,22 +47,16 @@ class RunState:
     def __init__(self, agent: OffPolicyAlgorithm, callback: BaseCallback) -> None:
         self._agent = agent
         self._components = components(agent, callback)
-        self._bases = self._find_bases()
-        self._environments: dict[str, Environments] = {
-            name: snapshot_environments(base) for name, base in self._bases.items()
+        self._environments = {
+            name: snapshot_environments(part)
+            for name, part in self._components.items()
+            if isinstance(part, VecEnv) and not isinstance(part, VecEnvWrapper)
         }
 
-    def _find_bases(self) -> dict[str, VecEnv]:
-        bases = {}
-        for name, part in self._components.items():
-            if isinstance(part, VecEnv) and list(layers_of(part)) == [part]:
-                bases[name] = part
-        return bases
-
     @property
-    def worker_environments(self) -> list[SubprocVecEnv]:
+    def in_workers(self) -> list[SubprocVecEnv]:
         """The vectorized environments whose environments are in processes of their own."""
-        return [base for base in self._bases.values() if isinstance(base, SubprocVecEnv)]
+        return [envs.vec_env for envs in self._environments.values() if isinstance(envs, WorkerEnvironments)]
 
     @property
     def class_names(self) -> dict[str, str]:
@@ -89,12 +71,13 @@ class RunState:
         for environments in self._environments.values():
             environments.apply(range(len(environments)), SnapshotEnvWrapper.verify)
 
-    def capture(self) -> Captured:
+    def capture(self) -> Encoded:
         """Read the state.
 
+        :return: by section: the run, and each environment. The networks are among the arrays only.
         :raises CheckpointError: if part of it cannot be written as data; names the attribute.
         """
-        sections: dict[str, Encoded] = {RUN: self._encode()[1]}
+        sections = {RUN: self._encode(Encoder())}
         for name, environments in self._environments.items():
             in_workers = isinstance(environments, WorkerEnvironments)
             captured = environments.apply(range(len(environments)), capture_environment, in_workers)
@@ -103,38 +86,37 @@ class RunState:
         arrays = in_section(_POLICY, {name: tensor.cpu().numpy() for name, tensor in networks.items()})
         for section, encoded in sections.items():
             arrays |= in_section(section, encoded.arrays)
-        return Captured({section: encoded.json for section, encoded in sections.items()}, arrays)
+        return Encoded({section: encoded.json for section, encoded in sections.items()}, arrays)
 
-    def restore(self, captured: Captured, classes: tuple[Any, ...] = ()) -> None:
+    def restore(self, state: Encoded, classes: tuple[Any, ...] = ()) -> None:
         """Put the run into a state.
 
-        :param captured: from :meth:`capture` of a run that was set up the same way.
+        :param state: from :meth:`capture` of a run that was set up the same way.
         :param classes: classes and functions that the checkpoint may refer to, besides SB3's and those that
             this run uses.
         :raises CheckpointError: if the state is of another run.
         """
         own = [f"{name}[{index}]" for name, envs in self._environments.items() for index in range(len(envs))]
-        if set(captured.json) != {RUN, *own}:
+        if set(state.json) != {RUN, *own}:
             raise CheckpointError(
-                f"The checkpoint holds {sorted(captured.json)}, this run consists of {sorted([RUN, *own])}."
+                f"The checkpoint holds {sorted(state.json)}, this run consists of {sorted([RUN, *own])}."
             )
         monitors = {}
         for name, environments in self._environments.items():
             indices = range(len(environments))
-            arguments = [(_section(captured, f"{name}[{index}]"), classes) for index in indices]
+            arguments = [(_section(state, f"{name}[{index}]"), classes) for index in indices]
             monitors[name] = environments.apply_each(indices, restore_environment, arguments)
-        set_networks(self._agent, captured.arrays)
-        rest = self._decode(_section(captured, RUN), classes)
+        set_networks(self._agent, state.arrays)
+        rest = self._decode(_section(state, RUN), classes)
         # Files come after all that may be refused: a run that does not go on leaves them as they were.
         for name, environments in self._environments.items():
             contents = [(written,) for written in monitors[name]]
             environments.apply_each(range(len(environments)), write_monitor_files, contents)
         self._set_rest(rest)
 
-    def _encode(self) -> tuple[Encoder, Encoded]:
+    def _encode(self, encoder: Encoder) -> Encoded:
         parts = self._components
         capture = Capture(handler_of, {id(part): Ref(i) for i, part in enumerate(parts.values())}, len(parts))
-        encoder = Encoder()
         attributes: dict[str, Any] = {}
         nodes: list[Any] = []
         for name, part in parts.items():
@@ -146,24 +128,19 @@ class RunState:
                 raise CheckpointError(_refusal(name, part, error)) from error
         rest = {
             "seconds": (time.time_ns() - self._agent.start_time) / 1e9,
-            "planners": {name: planner.memory for name, planner in self.planners().items()},
-            "files": {name: self._written(part) for name, part in parts.items()},
+            "searchers": {name: part._search_memory() for name, part in self._searching().items()},
+            "files": {name: read_written(file_of(part)) for name, part in parts.items()},
             "generators": read_generators(),
         }
-        data = {
-            "attributes": attributes,
-            "rest": encoder.encode(rest),
-            "nodes": nodes,
-        }
-        return encoder, Encoded(data, encoder.arrays)
+        data = {"attributes": attributes, "rest": encoder.encode(rest), "nodes": nodes}
+        return Encoded(data, encoder.arrays)
 
     def _decode(self, encoded: Encoded, classes: tuple[Any, ...]) -> dict[str, Any]:
-        parts = self._components
-        names = {**known_names(classes), **self._encode()[0].names}
-        decoder = Decoder(encoded.arrays, names)
-        restore = Restore(
-            decoder.decode_nodes(encoded.json["nodes"]), HANDLERS, list(parts.values()), "restore"
-        )
+        parts, used_here = self._components, Encoder()
+        self._encode(used_here)
+        decoder = Decoder(encoded.arrays, {**known_names(classes), **used_here.names})
+        nodes = decoder.decode_nodes(encoded.json["nodes"])
+        restore = Restore(nodes, HANDLERS, list(parts.values()), "restore")
         if encoded.json["attributes"].keys() != parts.keys():
             raise CheckpointError("The checkpoint's run has other parts than this one.")
         try:
@@ -183,41 +160,23 @@ class RunState:
     def _set_rest(self, rest: dict[str, Any]) -> None:
         agent = self._agent
         agent.start_time = time.time_ns() - int(rest["seconds"] * 1e9)
-        for part in self._components.values():
-            if isinstance(part, SearchAttributes | SearchPolicy):  # a callback may have changed its settings
-                part._follow_settings()
-        for name, planner in self.planners().items():
-            planner.memory = rest["planners"][name]
+        for name, part in self._searching().items():
+            part._go_on_searching(rest["searchers"][name])
         open_log_files(agent.logger)
         for name, written in rest["files"].items():
-            if written is not None:
-                write_again(self._file(self._components[name]), written)
+            write_again(file_of(self._components[name]), written)
         # Last, since whatever is made on the way may draw from them.
         set_generators(rest["generators"])
 
-    def planners(self) -> dict[str, Any]:
-        found = {}
-        for name, part in self._components.items():
-            planner = vars(part).get("planner", vars(part).get("planner"))
-            if planner is not None and not isinstance(part, th.nn.Module):
-                found[name] = planner
-        return found
-
-    def _file(self, part: Any) -> Any:
-        if isinstance(part, KVWriter):
-            return file_of(part)
-        return results_file(part) if isinstance(part, VecMonitor) else None
-
-    def _written(self, part: Any) -> np.ndarray | None:
-        file = self._file(part)
-        return None if file is None else read_written(file)
+    def _searching(self) -> dict[str, Searching]:
+        return {name: part for name, part in self._components.items() if isinstance(part, Searching)}
 
 
 def set_networks(agent: OffPolicyAlgorithm, arrays: dict[str, np.ndarray]) -> None:
     """Give an agent the networks of a checkpoint.
 
     :param agent: the agent.
-    :param arrays: of :class:`Captured`.
+    :param arrays: from :meth:`RunState.capture`.
     :raises CheckpointError: if they are other networks.
     """
     tensors = {name: th.from_numpy(array) for name, array in of_section(_POLICY, arrays).items()}
@@ -229,16 +188,15 @@ def set_networks(agent: OffPolicyAlgorithm, arrays: dict[str, np.ndarray]) -> No
         ) from error
 
 
-def _section(captured: Captured, name: str) -> Encoded:
-    return Encoded(captured.json[name], of_section(name, captured.arrays))
+def _section(state: Encoded, name: str) -> Encoded:
+    return Encoded(state.json[name], of_section(name, state.arrays))
 
 
 def _refusal(name: str, part: Any, error: Exception) -> str:
     path = "".join(getattr(error, "path", ()))
     reason = getattr(error, "reason", str(error))
     return (
-        f"{path or type(part).__name__} (in {name}) cannot be part of a checkpoint: {reason}. Leave it "
-        "out of "
-        "the class's state (list its name in a class attribute not_checkpointed), or register a pair of "
+        f"{path or type(part).__name__} (in {name}) cannot be part of a checkpoint: {reason}. Leave it out "
+        "of the class's state (list its name in a class attribute not_checkpointed), or register a pair of "
         "functions for its class with sb3_mcbs.checkpoints.register_state."
     )

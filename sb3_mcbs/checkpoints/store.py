@@ -9,15 +9,16 @@ import io
 import json
 import os
 import shutil
+import warnings
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_mcbs.checkpoints.encoding import dumps
+from sb3_mcbs.checkpoints.encoding import Encoded
 from sb3_mcbs.checkpoints.errors import CheckpointError
 
 FORMAT = 1
@@ -28,71 +29,40 @@ STEP = "step_"
 _MAX_MANIFEST = 16 * 2**20
 
 
-class FileSeal(NamedTuple):
-    """What a file must be.
-
-    :param size: in bytes.
-    :param sha256: of its content.
-    """
-
-    size: int
-    sha256: str
-
-
 class Checkpoint(NamedTuple):
     """A checkpoint that was read and found whole, all but the replay buffer's rows.
 
-    :param folder: where it is.
     :param manifest: what it says about itself.
-    :param state: the state as JSON.
-    :param arrays: the state's arrays, by section and dtype.
+    :param state: its arrays are by section and dtype.
     """
 
-    folder: Path
     manifest: dict[str, Any]
-    state: Any
-    arrays: dict[str, np.ndarray]
+    state: Encoded
 
 
-class _Sealing(io.BufferedIOBase):
-    """A file for writing that computes its seal on the way."""
-
-    def __init__(self, file: BinaryIO) -> None:
-        super().__init__()
-        self._file = file
-        self._digest = hashlib.sha256()
-        self._size = 0
-
-    def writable(self) -> bool:
-        return True
-
-    def write(self, data: Any) -> int:
-        self._digest.update(data)
-        self._size += memoryview(data).nbytes
-        return self._file.write(data)
-
-    def flush(self) -> None:
-        self._file.flush()
-
-    @property
-    def seal(self) -> FileSeal:
-        return FileSeal(self._size, self._digest.hexdigest())
+#: What a file must be, as JSON has it: its size and the SHA-256 of its content.
+Seal = list[Any]
 
 
-def write_file(path: Path, write: Callable[[Any], Any]) -> FileSeal:
+def write_file(path: Path, write: Callable[[Any], Any]) -> Seal:
     """Write a file and have it on the disk when this returns.
 
     :param path: the file.
-    :param write: called with an open file that cannot be sought in.
+    :param write: called with the open file.
     """
-    with open(path, "wb") as file:
-        with _Sealing(file) as sealing:  # closed while the file is open, which closing flushes
-            write(sealing)
+    with open(path, "w+b") as file:
+        write(file)
+        file.flush()
         os.fsync(file.fileno())
-    return sealing.seal
+        return _seal_of(file)
 
 
-def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> FileSeal:
+def _seal_of(file: io.BufferedRandom | io.BufferedReader) -> Seal:
+    file.seek(0)
+    return [os.fstat(file.fileno()).st_size, hashlib.file_digest(file, "sha256").hexdigest()]
+
+
+def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> Seal:
     """Write arrays as an uncompressed npz.
 
     :param path: the file.
@@ -164,30 +134,26 @@ class Store:
             seal = write_arrays(unfinished, arrays)
         os.replace(unfinished, self.rows_folder / name)
         sync_folder(self.rows_folder)
-        return {"name": name, "first": first, "end": end, "seal": list(seal)}
+        return {"name": name, "first": first, "end": end, "seal": seal}
 
-    def write(
-        self, step: int, manifest: dict[str, Any], state: Any, arrays: Mapping[str, np.ndarray]
-    ) -> None:
+    def write(self, step: int, manifest: dict[str, Any], state: Encoded) -> None:
         """Write a checkpoint; it appears whole or not at all.
 
         :param step: environment steps.
         :param manifest: what it says about itself; the seals of its files are added.
-        :param state: the state as JSON.
-        :param arrays: the state's arrays.
+        :param state: its arrays are by section and dtype.
         """
         final = self.path_of(step)
         unfinished = self.folder / (_UNFINISHED + final.name)
         _remove(unfinished)
         with _removed_if_it_fails(unfinished):
             unfinished.mkdir(parents=True)
-            seals = {
-                STATE: write_file(unfinished / STATE, lambda file: file.write(dumps(state))),
-                ARRAYS: write_arrays(unfinished / ARRAYS, arrays),
+            files = {
+                STATE: write_file(unfinished / STATE, lambda file: file.write(_dumps(state.json))),
+                ARRAYS: write_arrays(unfinished / ARRAYS, state.arrays),
             }
-            files = {name: list(seal) for name, seal in seals.items()}
             sealed = seal_manifest({**manifest, "files": files})
-            write_file(unfinished / MANIFEST, lambda file: file.write(dumps(sealed)))
+            write_file(unfinished / MANIFEST, lambda file: file.write(_dumps(sealed)))
             sync_folder(unfinished)
         if final.exists():  # a damaged one that a resumed run has passed again
             _remove(final)
@@ -246,18 +212,17 @@ class Store:
         manifest = read_manifest(folder)
         try:
             for name in (STATE, ARRAYS):
-                check_seal(folder / name, FileSeal(*manifest["files"][name]))
+                check_seal(folder / name, manifest["files"][name])
             for part in manifest["rows"]:
-                check_seal(self._rows_file(part), FileSeal(*part["seal"]))
+                check_seal(self._rows_file(part), part["seal"])
             state = json.loads((folder / STATE).read_bytes())
         except (KeyError, TypeError, ValueError, RecursionError) as error:
             raise CheckpointError(f"The files in {folder} are not a checkpoint: {error!r}") from error
-        return Checkpoint(folder, manifest, state, read_arrays(folder / ARRAYS))
+        return Checkpoint(manifest, Encoded(state, read_arrays(folder / ARRAYS)))
 
-    def read_newest(self, warn: Callable[[str], None]) -> Checkpoint:
-        """Read the newest checkpoint that is whole.
+    def read_newest(self) -> Checkpoint:
+        """Read the newest checkpoint that is whole, with a warning about every newer one that is not.
 
-        :param warn: called with a message about every newer one that is not.
         :raises CheckpointError: if there is none.
         """
         reasons = []
@@ -268,7 +233,8 @@ class Store:
                 reasons.append(str(error))
                 continue
             for reason in reasons:
-                warn(f"A damaged checkpoint is passed over: {reason} The one at {step} steps is used.")
+                message = f"A damaged checkpoint is passed over: {reason} The one at {step} steps is used."
+                warnings.warn(message, stacklevel=4)
             return checkpoint
         if reasons:
             raise CheckpointError(f"No checkpoint in {self.folder} is whole. " + " ".join(reasons))
@@ -304,10 +270,10 @@ def seal_manifest(content: Any) -> dict[str, Any]:
 
     :param content: what it says.
     """
-    return {"format": FORMAT, "sha256": hashlib.sha256(dumps(content)).hexdigest(), "content": content}
+    return {"format": FORMAT, "sha256": hashlib.sha256(_dumps(content)).hexdigest(), "content": content}
 
 
-def check_seal(path: Path, seal: FileSeal) -> None:
+def check_seal(path: Path, seal: Seal) -> None:
     """Refuse a file that is not what was written.
 
     :param path: the file.
@@ -315,15 +281,16 @@ def check_seal(path: Path, seal: FileSeal) -> None:
     :raises CheckpointError: names the file and the difference.
     """
     try:
-        size = path.stat().st_size
-        if size != seal.size:
-            raise CheckpointError(f"{path} has {size} bytes instead of {seal.size}.")
         with open(path, "rb") as file:
-            digest = hashlib.file_digest(file, "sha256").hexdigest()
+            found = _seal_of(file)
     except OSError as error:
         raise CheckpointError(f"{path} cannot be read: {error}.") from error
-    if digest != seal.sha256:
-        raise CheckpointError(f"The content of {path} is not what was written (SHA-256).")
+    if found != seal:
+        raise CheckpointError(f"The content of {path} is not what was written (size, SHA-256).")
+
+
+def _dumps(data: Any) -> bytes:
+    return json.dumps(data, allow_nan=False, separators=(",", ":")).encode()
 
 
 @contextmanager

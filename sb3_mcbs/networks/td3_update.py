@@ -7,9 +7,9 @@ so both give the same networks up to float32 rounding.
 """
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
@@ -167,6 +167,8 @@ class FastUpdate(TD3):
     A subclass's constructor sets :attr:`fast_update` before the networks are set up.
     """
 
+    #: What neither ``save`` nor an exact checkpoint contains, and why.
+    not_checkpointed: ClassVar[Collection[str]] = {"_reasons_said": "what the user of this process was told"}
     #: Whether to; ``False`` leaves gradient steps to SB3.
     fast_update: bool
     #: Why they were left to SB3 although it is True, as far as the user was told.
@@ -214,7 +216,7 @@ class FastUpdate(TD3):
             update.train(gradient_steps, batch_size)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_reasons_said"]
+        return [*super()._excluded_save_params(), *FastUpdate.not_checkpointed]
 
 
 def _actor_and_parameters(actor: Any) -> tuple[MLP, list[Any]]:

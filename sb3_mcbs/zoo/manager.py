@@ -17,8 +17,7 @@ from sb3_mcbs.agents.hyperparameters import REMOVED, SETTING_NAMES, refuse_remov
 from sb3_mcbs.agents.registry import SEARCHING
 from sb3_mcbs.agents.schedule import SCHEDULES, UNITS
 from sb3_mcbs.checkpoints import CheckpointError, ExactCheckpointCallback
-from sb3_mcbs.checkpoints.resume import continue_with
-from sb3_mcbs.checkpoints.resumption import Resumption
+from sb3_mcbs.checkpoints.resume import CheckpointedRun
 from sb3_mcbs.models import ForwardModelError
 from sb3_mcbs.search import PRESETS, SearchSettings, with_preset
 from sb3_mcbs.search.settings import MATMUL_PRECISIONS, STRATEGIES
@@ -50,12 +49,12 @@ class ResumedRun(NamedTuple):
     A run that is continued instead of a new one.
 
     :param folder: its folder
-    :param resumption: its newest checkpoint
+    :param checkpointed: the run, as its newest checkpoint has it
     :param log_folder: its folder for TensorBoard, if it has one
     """
 
     folder: Path
-    resumption: Resumption
+    checkpointed: CheckpointedRun
     log_folder: str | None
 
 
@@ -99,9 +98,9 @@ class MCBSExperimentManager(ExperimentManager):
         """
         result = super().setup_experiment()
         if result is not None and self.resumed_run is not None:
-            _, resumption, log_folder = self.resumed_run
+            _, checkpointed, log_folder = self.resumed_run
             assert isinstance(result[0], OffPolicyAlgorithm)
-            continue_with(result[0], resumption, log_folder)
+            checkpointed.continue_with(result[0], log_folder)
         return result
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 from sb3_mcbs.checkpoints import CheckpointError
-from sb3_mcbs.checkpoints.resume import read_resumption
+from sb3_mcbs.checkpoints.resume import read_run
 from sb3_mcbs.checkpoints.store import Store
 from sb3_mcbs.zoo.manager import CHECKPOINTS, MCBSExperimentManager, ResumedRun
 from sb3_mcbs.zoo.paths import PathError
@@ -28,14 +28,14 @@ def resume(run_folder: str | Path) -> None:
             "-params \"callback:[{'sb3_mcbs.ExactCheckpointCallback': {'save_freq': 10000}}]\", or in the "
             "hyperparameter file callback: [{sb3_mcbs.ExactCheckpointCallback: {save_freq: 10000}}]."
         )
-    resumption = read_resumption(folder / CHECKPOINTS)
-    MCBSExperimentManager.resumed_run = ResumedRun(folder, resumption, args.get("tensorboard_log") or None)
+    run = read_run(folder / CHECKPOINTS)
+    MCBSExperimentManager.resumed_run = ResumedRun(folder, run, args.get("tensorboard_log") or None)
     monitor_files = {path: path.read_bytes() for path in folder.glob("*.monitor.csv")}
     try:
         repeat(folder)
     finally:
         MCBSExperimentManager.resumed_run = None
-        if not resumption.is_carried_out:  # RL Zoo empties them before anything is checked
+        if not run.goes_on:  # RL Zoo empties them before anything is checked
             for path, content in monitor_files.items():
                 path.write_bytes(content)
 
