@@ -35,11 +35,19 @@ def capture_attributes(
             if captured is not None:
                 attributes[name] = captured[0]
         else:
-            attributes[name] = _capture(capture, env, name, value)
+            attributes[name] = capture_attribute(capture, env, name, value)
     return attributes
 
 
-def _capture(capture: Capture, env: Any, name: str, value: Any) -> Any:
+def capture_attribute(capture: Capture, env: Any, name: str, value: Any) -> Any:
+    """Capture one attribute of a layer.
+
+    :param capture: what captures it.
+    :param env: the wrapper or environment.
+    :param name: of the attribute.
+    :param value: of the attribute.
+    :raises SnapshotUnsupportedError: names the attribute.
+    """
     try:
         return capture(value)
     except SnapshotUnsupportedError as error:
@@ -49,6 +57,23 @@ def _capture(capture: Capture, env: Any, name: str, value: Any) -> Any:
         too_deep = SnapshotUnsupportedError("objects in it hold each other too many levels deep")
         too_deep.path.append(f"{type(env).__name__}.{name}")
         raise too_deep from error
+
+
+def restore_attribute(restore: Restore, env: Any, name: str, value: Any, current: Any = MISSING) -> Any:
+    """Plan to put back one attribute of a layer, and return its value.
+
+    :param restore: keeps the plan.
+    :param env: the wrapper or environment.
+    :param name: of the attribute.
+    :param value: its captured value.
+    :param current: what the attribute is now.
+    :raises SnapshotUnsupportedError: names the attribute.
+    """
+    try:
+        return restore(value, current)
+    except SnapshotUnsupportedError as error:
+        error.path.insert(0, f"{type(env).__name__}.{name}")
+        raise
 
 
 def restore_attributes(
@@ -70,11 +95,7 @@ def restore_attributes(
             if there is not None and stays(there, handler_of):  # such as a window that was opened since
                 del values[name]
         elif type(value) is Ref and name != "_np_random":
-            try:
-                values[name] = restore(value, have.get(name, MISSING))
-            except SnapshotUnsupportedError as error:
-                error.path.insert(0, f"{type(env).__name__}.{name}")
-                raise
+            values[name] = restore_attribute(restore, env, name, value, have.get(name, MISSING))
             if values[name] is MISSING:
                 del values[name]
     # Gymnasium keeps it on the class until it is first needed.

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
-from sb3_mcbs.snapshot.object_graph import Capture, Copier, Restore, class_name
+from sb3_mcbs.snapshot.object_graph import Capture, Restore, class_name
 from sb3_mcbs.snapshot.pygame_values import is_display, value_class
 
 #: Windows, render contexts and what lies in their memory: whatever is there stays, a copy has none.
@@ -76,9 +76,6 @@ class DrawnHandler:
 
     def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
         raise AssertionError("nothing of this kind is captured")
-
-    def copy(self, copier: Copier, obj: Any) -> Any:
-        return self.capture(Capture(lambda _: None, {}, 0), obj)
 
 
 def stays(obj: Any, handler_of: Callable[[Any], Any]) -> bool:

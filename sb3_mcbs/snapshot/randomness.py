@@ -6,7 +6,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_mcbs.snapshot import generators
-from sb3_mcbs.snapshot.object_graph import MISSING, Capture, Copier, Ref, Restore
+from sb3_mcbs.snapshot.object_graph import MISSING, Capture, Ref, Restore
 from sb3_mcbs.snapshot.spaces import definition_of, is_defined_as, made_of, parts_of
 
 _GLOBAL = "global"
@@ -57,16 +57,6 @@ class GeneratorHandler:
         restore.do_then(generators.set_state, generator, state)
         if seeds is not None and sequence is not None:
             restore.do_then(generators.set_seeds, sequence, seeds)
-        return generator
-
-    def copy(self, copier: Copier, obj: Any) -> Any:
-        if generators.global_name(obj) is not None:
-            return obj
-        bits = generators.bits_of(obj)
-        if bits is not obj:
-            return type(obj)(copier.copy(bits))
-        generator = generators.make_like(type(obj), type(obj), copier.copy(generators.sequence_of(obj)))
-        generators.set_state(generator, generators.get_state(obj))
         return generator
 
 
@@ -122,9 +112,6 @@ class SeedsHandler:
             restore.do_then(generators.set_seeds, sequence, generators.read_seeds(sequence))
         return sequence
 
-    def copy(self, copier: Copier, obj: np.random.SeedSequence) -> Any:
-        return generators.make_sequence(generators.read_seeds(obj))
-
 
 def _reseed_sequence(
     sequence: np.random.SeedSequence, seeds: generators.Seeds, rng: np.random.Generator
@@ -152,11 +139,6 @@ class SpaceHandler:
         for part, value in zip(parts, generators_of_parts, strict=True):
             restore_np_random(restore, value, vars(part))
         return current
-
-    def copy(self, copier: Copier, obj: spaces.Space) -> Any:
-        made = copier.enter(obj, object.__new__(type(obj)))
-        vars(made).update({name: copier.copy(value) for name, value in vars(obj).items()})
-        return made
 
 
 def restore_np_random(restore: Restore, value: Any, attributes: dict[str, Any]) -> None:

@@ -1,7 +1,6 @@
 """The state of a stack of layers: captured, checked, put back, cloned."""
 
 import contextlib
-import itertools
 import operator
 import types
 from collections.abc import Callable, Iterator
@@ -9,13 +8,19 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 
-from sb3_mcbs.snapshot.attributes import capture_attributes, restore_attributes
+from sb3_mcbs.snapshot.attributes import (
+    capture_attribute,
+    capture_attributes,
+    restore_attribute,
+    restore_attributes,
+)
+from sb3_mcbs.snapshot.cloning import Cloner
 from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
 from sb3_mcbs.snapshot.functions import is_own
 from sb3_mcbs.snapshot.global_generators import globals_kept
 from sb3_mcbs.snapshot.handlers import HANDLERS, handler_of, plan_adapter
 from sb3_mcbs.snapshot.layers import OF_ONE_MONITOR, Layer, layers_of
-from sb3_mcbs.snapshot.object_graph import Capture, Copier, Node, Ref, Restore, RngMode
+from sb3_mcbs.snapshot.object_graph import Capture, Node, Ref, Restore, RngMode
 from sb3_mcbs.snapshot.objects import attributes_of, blank, set_attributes
 from sb3_mcbs.snapshot.pairing import CapturedLayer, check, pair
 from sb3_mcbs.snapshot.places import Places
@@ -261,31 +266,32 @@ class Stack:
 
         :return: the outermost layer of the copy.
         """
-        copies: dict[int, Any] = {}
-        copier = Copier(handler_of, copies)
-        ordinary: list[Layer] = []
-        for layer in reversed(self.layers):
+        cloner = Cloner(self._refs, len(self.layers))
+        made = cloner.restore.memo
+        classes = []
+        for place, layer in reversed([*enumerate(self.layers)]):
             adapter = self._adapters.get(id(layer.env))
             if adapter is None:
-                cls = copier.copy(layer.cls)
-                copies[id(layer.env)] = blank(stand_in(cls) if layer.left_out else cls)
-                ordinary.append(layer)
+                classes.append(cloner.capture(layer.cls))
+                cls = cloner.restore(classes[-1])
+                made[place] = blank(stand_in(cls) if layer.left_out else cls)
             else:
                 with globals_kept():
-                    copies[id(layer.env)] = adapter.clone(layer.env, copier.copy)
-        outermost = copies[id(self._owner)] = copies[id(self.layers[0].env)]
-        # Simulators first, wherever they hang: attributes may be views into their memory.
-        capture = Capture(handler_of, self._refs, len(self.layers))
-        captured = [self._capture_layer(capture, layer, monitor=False) for layer in ordinary]
+                    made[place] = adapter.clone(layer.env, cloner)
+        captured = {
+            place: _capture_for_clone(cloner.capture, layer)
+            for place, layer in reversed([*enumerate(self.layers)])
+            if id(layer.env) not in self._adapters
+        }
         if not self.incomplete_clones:  # those are completed by what keep() has checked
-            check_held(capture, captured)
-        for simulator in capture.adapted:
-            copier.copy(simulator)
-        for layer in ordinary:
-            _copy_attributes(copier, layer)
-        for layer, below in itertools.pairwise(self.layers):
-            copies[id(layer.env)].env = copies[id(below.env)]
-        return outermost
+            check_held(cloner.capture, [*classes, *captured.values()])
+        cloner.make_simulators()
+        for place, attributes in captured.items():
+            _restore_into_clone(cloner.restore, made[place], attributes)
+        cloner.restore.commit()
+        for place in range(len(self.layers) - 1):
+            made[place].env = made[place + 1]
+        return made[0]
 
 
 def _all_but_remembered(layer: Layer) -> frozenset[str]:
@@ -302,7 +308,8 @@ def _with_adapter(layer: Layer) -> Layer:
     return layer if adapter is None else layer._replace(not_state=layer.not_state | adapter.not_state)
 
 
-def _copy_attributes(copier: Copier, layer: Layer) -> None:
+def _capture_for_clone(capture: Capture, layer: Layer) -> dict[str, Any]:
+    """Capture the attributes that a layer's copy is to have."""
     attributes: dict[str, Any] = {}
     for name, value in attributes_of(layer.env).items():
         if name in layer.own:
@@ -314,9 +321,10 @@ def _copy_attributes(copier: Copier, layer: Layer) -> None:
         elif name in layer.not_state:
             attributes[name] = value
         else:
-            try:
-                attributes[name] = copier.copy(value)
-            except SnapshotUnsupportedError as error:
-                error.path.insert(0, f"{type(layer.env).__name__}.{name}")
-                raise
-    set_attributes(copier.memo[id(layer.env)], attributes)
+            attributes[name] = capture_attribute(capture, layer.env, name, value)
+    return attributes
+
+
+def _restore_into_clone(restore: Restore, made: Any, attributes: dict[str, Any]) -> None:
+    values = {name: restore_attribute(restore, made, name, value) for name, value in attributes.items()}
+    set_attributes(made, values)
