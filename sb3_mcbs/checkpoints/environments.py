@@ -14,8 +14,8 @@ from sb3_mcbs.checkpoints.errors import CheckpointError
 from sb3_mcbs.checkpoints.files import read_written, results_file, write_again
 from sb3_mcbs.checkpoints.names import known_names
 from sb3_mcbs.snapshot import Snapshot, SnapshotEnvWrapper, SnapshotError
-from sb3_mcbs.snapshot.pairing import CapturedLayer
-from sb3_mcbs.snapshot.replay import Episode
+from sb3_mcbs.snapshot.layers import CapturedLayer
+from sb3_mcbs.snapshot.replay import RecordedEpisode
 
 _Generators = dict[str, Any]
 
@@ -188,7 +188,7 @@ def make_environment(description: dict[str, Any]) -> SnapshotEnvWrapper:
     return SnapshotEnvWrapper(env, verify=description.get("verify", True))
 
 
-register_state(Episode, tuple, lambda data: Episode(*data))
+register_state(RecordedEpisode, tuple, lambda data: RecordedEpisode(*data))
 try:
     from sb3_mcbs.snapshot.mujoco import DataState, ModelState
 except ImportError:  # MuJoCo is an optional part of Gymnasium

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sb3_mcbs.snapshot import SnapshotAdapter, SnapshotEnvWrapper, SnapshotUnsupportedError
-from sb3_mcbs.snapshot.global_generators import global_states, isolated_globals
+from sb3_mcbs.snapshot.generators import global_states, isolated_globals
 from sb3_mcbs.snapshot.registry import find_adapter
 from sb3_mcbs.snapshot.spaces import random_action, values_of
 

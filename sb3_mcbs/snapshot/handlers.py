@@ -13,13 +13,13 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec, WrapperSpec
 
-from sb3_mcbs.snapshot import generators
 from sb3_mcbs.snapshot.arrays import ArrayHandler, BytearrayHandler
 from sb3_mcbs.snapshot.classes import ClassHandler, LocalClassHandler, is_local, is_made_per_instance
 from sb3_mcbs.snapshot.containers import DictHandler, SequenceHandler, TupleHandler
 from sb3_mcbs.snapshot.drawing import DrawnHandler, kind_name
 from sb3_mcbs.snapshot.errors import SnapshotMismatchError
 from sb3_mcbs.snapshot.functions import BuiltinMethodHandler, CellHandler, FunctionHandler, MethodHandler
+from sb3_mcbs.snapshot.generators import GeneratorHandler, SeedsHandler, is_generator
 from sb3_mcbs.snapshot.object_graph import (
     ATOMIC_CLASSES,
     MISSING,
@@ -36,9 +36,9 @@ from sb3_mcbs.snapshot.objects import (
     is_ordinary,
     restore_content,
 )
-from sb3_mcbs.snapshot.pygame_values import PygameHandler, SurfaceHandler
-from sb3_mcbs.snapshot.randomness import GeneratorHandler, SeedsHandler, SpaceHandler
+from sb3_mcbs.snapshot.pygame_values import PygameHandler, SurfaceHandler, is_display
 from sb3_mcbs.snapshot.registry import SnapshotAdapter, call_on_change, find_adapter
+from sb3_mcbs.snapshot.spaces import SpaceHandler
 from sb3_mcbs.snapshot.tensors import TensorHandler, is_tensor
 from sb3_mcbs.snapshot.weak import PROXIES, ProxyHandler, WeakrefHandler
 
@@ -203,6 +203,17 @@ def handler_of(obj: Any) -> TypeHandler | None:
     return handler
 
 
+def stays(obj: Any) -> bool:
+    """Return whether an object is no state: it stays where it is, whatever was there before.
+
+    :param obj: any object.
+    """
+    handler = handler_of(obj)
+    if handler is None:
+        return False
+    return handler.name in ("constant", "window") or (handler.name == "surface" and is_display(obj))
+
+
 def _decide_class(cls: type) -> TypeHandler | None:
     if is_made_per_instance(cls, handler_of):
         return HANDLERS["class"]
@@ -230,7 +241,7 @@ def _decide(obj: Any, cls: type) -> TypeHandler | None:
         return HANDLERS[drawing]
     if is_tensor(obj):
         return HANDLERS["torch"]
-    if generators.is_generator(obj):
+    if is_generator(obj):
         return HANDLERS["generator"]
     if issubclass(cls, spaces.Space):
         return HANDLERS["space"]

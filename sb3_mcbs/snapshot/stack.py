@@ -3,28 +3,29 @@
 import contextlib
 import operator
 import types
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import gymnasium as gym
 
-from sb3_mcbs.snapshot.attributes import (
-    capture_attribute,
-    capture_attributes,
-    restore_attribute,
-    restore_attributes,
-)
 from sb3_mcbs.snapshot.cloning import Cloner
-from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
+from sb3_mcbs.snapshot.errors import SnapshotMismatchError, SnapshotUnsupportedError
 from sb3_mcbs.snapshot.functions import is_own
-from sb3_mcbs.snapshot.global_generators import globals_kept
-from sb3_mcbs.snapshot.handlers import HANDLERS, handler_of, plan_adapter
-from sb3_mcbs.snapshot.layers import OF_ONE_MONITOR, Layer, layers_of
+from sb3_mcbs.snapshot.generators import globals_kept
+from sb3_mcbs.snapshot.handlers import HANDLERS, handler_of
+from sb3_mcbs.snapshot.layers import (
+    CapturedLayer,
+    Layer,
+    capture_for_clone,
+    capture_layer,
+    layers_of,
+    restore_into_clone,
+    restore_layer,
+)
 from sb3_mcbs.snapshot.object_graph import Capture, Node, Ref, Restore, RngMode
-from sb3_mcbs.snapshot.objects import attributes_of, blank, set_attributes
-from sb3_mcbs.snapshot.pairing import CapturedLayer, check, pair
+from sb3_mcbs.snapshot.objects import attributes_of, blank
 from sb3_mcbs.snapshot.places import Places
-from sb3_mcbs.snapshot.registry import SnapshotAdapter, find_adapter
+from sb3_mcbs.snapshot.registry import find_adapter
 from sb3_mcbs.snapshot.stand_ins import stand_in
 from sb3_mcbs.snapshot.tensors import check_memory
 from sb3_mcbs.snapshot.weak import check_held
@@ -53,8 +54,7 @@ class Stack:
     """
 
     def __init__(self, owner: gym.Wrapper[Any, Any, Any, Any]) -> None:
-        self.layers = [_with_adapter(layer) for layer in layers_of(owner.env)]
-        self._adapters: dict[int, SnapshotAdapter] = {}
+        self.layers = layers_of(owner.env)
         self._owner = owner
         self.monitors = [layer.env for layer in self.layers if layer.monitor]
         #: Each says whether a simulator gave up its state since it was called last.
@@ -66,10 +66,8 @@ class Stack:
                     f"{layer.name} draws its observations, and copies of an environment cannot draw. "
                     "Remove the wrapper."
                 )
-            adapter = None if layer.left_out else find_adapter(layer.env)
-            if adapter is not None:
-                adapter.attach(layer.env)
-                self._adapters[id(layer.env)] = adapter
+            if layer.adapter is not None:
+                layer.adapter.attach(layer.env)
         self._refs = {id(layer.env): Ref(place) for place, layer in enumerate(self.layers)}
         self._refs[id(owner)] = Ref(0)
 
@@ -110,12 +108,12 @@ class Stack:
     @property
     def incomplete_clones(self) -> bool:
         """Whether a clone is not yet in the state of the original."""
-        return any(adapter.with_attributes for adapter in self._adapters.values())
+        return any(layer.adapter is not None and layer.adapter.with_attributes for layer in self.layers)
 
     @property
     def simulators(self) -> list[Any]:
         """The objects and layers that adapters capture."""
-        adapted = [layer.env for layer in self.layers if id(layer.env) in self._adapters]
+        adapted = [layer.env for layer in self.layers if layer.adapter is not None]
         return [*(self._watched or ()), *adapted]
 
     def capture(self, monitor: bool = True) -> tuple[tuple[CapturedLayer, ...], tuple[Node, ...]]:
@@ -136,7 +134,7 @@ class Stack:
         """
         while True:
             capture = Capture(handler_of, self._refs, len(self.layers), Places(self._watched or ()))
-            captured = tuple([self._capture_layer(capture, layer, monitor) for layer in self.layers])
+            captured = tuple([capture_layer(capture, layer, monitor) for layer in self.layers])
             self._watch(capture.adapted)
             if capture.places.are_of(capture.adapted):
                 break
@@ -191,20 +189,6 @@ class Stack:
             if watch is not None:
                 self.watches.append(watch)
 
-    def _capture_layer(self, capture: Capture, layer: Layer, monitor: bool) -> CapturedLayer:
-        env, adapter = layer.env, self._adapters.get(id(layer.env))
-        adapted = None if adapter is None else (adapter.capture(env),)
-        attributes = own = cls = None
-        if adapter is None or adapter.with_attributes:
-            attributes = capture_attributes(capture, env, layer.not_state, adapter is not None)
-        if layer.monitor and monitor:
-            own = capture_attributes(capture, env, _all_but_remembered(layer), False)
-        if adapter is None:
-            cls = capture(layer.cls)
-        return CapturedLayer(
-            layer.name, layer.left_out, adapted, attributes, own, cls if type(cls) is Ref else None
-        )
-
     def check(self, captured: tuple[CapturedLayer, ...]) -> None:
         """Refuse the state of other layers.
 
@@ -239,27 +223,14 @@ class Stack:
         places = Places(self._watched or ())
         while True:
             restore = Restore(nodes, HANDLERS, known, rng, originals, places, foreign)
-            self._plan(restore, layers, captured)
+            for layer, saved in zip(layers, captured, strict=True):
+                if layer is not None:
+                    restore_layer(restore, layer, saved)
             simulators = [restore.adapted[index] for index in sorted(restore.adapted)]
             if places.are_of(simulators):
                 break
             places = Places(simulators)
         restore.commit()
-
-    def _plan(
-        self, restore: Restore, layers: list[Layer | None], captured: tuple[CapturedLayer, ...]
-    ) -> None:
-        for layer, saved in zip(layers, captured, strict=True):
-            if layer is None:
-                continue
-            adapter = self._adapters.get(id(layer.env))
-            if saved.adapted is not None:
-                plan_adapter(restore, adapter, layer.env, saved.adapted[0])
-            restore(saved.cls, layer.cls)
-            if saved.attributes is not None:
-                restore_attributes(restore, layer.env, layer.not_state, saved.attributes, adapter is None)
-            if saved.own is not None and layer.monitor:
-                restore_attributes(restore, layer.env, _all_but_remembered(layer), saved.own, False)
 
     def clone(self) -> gym.Env[Any, Any]:
         """Copy the layers; those that only monitor, draw or record are stand-ins in the copy.
@@ -270,61 +241,110 @@ class Stack:
         made = cloner.restore.memo
         classes = []
         for place, layer in reversed([*enumerate(self.layers)]):
-            adapter = self._adapters.get(id(layer.env))
-            if adapter is None:
+            if layer.adapter is None:
                 classes.append(cloner.capture(layer.cls))
                 cls = cloner.restore(classes[-1])
                 made[place] = blank(stand_in(cls) if layer.left_out else cls)
             else:
                 with globals_kept():
-                    made[place] = adapter.clone(layer.env, cloner)
+                    made[place] = layer.adapter.clone(layer.env, cloner)
         captured = {
-            place: _capture_for_clone(cloner.capture, layer)
+            place: capture_for_clone(cloner.capture, layer)
             for place, layer in reversed([*enumerate(self.layers)])
-            if id(layer.env) not in self._adapters
+            if layer.adapter is None
         }
         if not self.incomplete_clones:  # those are completed by what keep() has checked
             check_held(cloner.capture, [*classes, *captured.values()])
         cloner.make_simulators()
         for place, attributes in captured.items():
-            _restore_into_clone(cloner.restore, made[place], attributes)
+            restore_into_clone(cloner.restore, made[place], attributes)
         cloner.restore.commit()
         for place in range(len(self.layers) - 1):
             made[place].env = made[place + 1]
         return made[0]
 
 
-def _all_but_remembered(layer: Layer) -> frozenset[str]:
-    """Name the attributes of a ``Monitor`` that others have set, and those that belong to one instance."""
-    return frozenset(attributes_of(layer.env)) - layer.own | OF_ONE_MONITOR
-
-
 def _is_method_of(layers: list[Layer], obj: Any) -> bool:
     return type(obj) is types.MethodType and any(obj.__self__ is layer.env for layer in layers)
 
 
-def _with_adapter(layer: Layer) -> Layer:
-    adapter = find_adapter(layer.env)
-    return layer if adapter is None else layer._replace(not_state=layer.not_state | adapter.not_state)
+def pair(layers: Sequence[Layer], captured: Sequence[CapturedLayer]) -> list[Layer | None]:
+    """Find for each captured layer the one to restore; None for one that may be missing, and is.
 
-
-def _capture_for_clone(capture: Capture, layer: Layer) -> dict[str, Any]:
-    """Capture the attributes that a layer's copy is to have."""
-    attributes: dict[str, Any] = {}
-    for name, value in attributes_of(layer.env).items():
-        if name in layer.own:
+    :param layers: of an environment.
+    :param captured: captured layers; :func:`check` has passed.
+    """
+    if len(layers) == len(captured) and all(map(_is_alike, layers, captured)):
+        return list(layers)
+    kept = iter([layer for layer in layers if not layer.left_out])
+    left_out = [layer for layer in layers if layer.left_out]
+    found: list[Layer | None] = []
+    for theirs in captured:
+        if not theirs.left_out:
+            found.append(next(kept))
             continue
-        if name == "render_mode" or name in layer.drawn:
-            attributes[name] = None
-        elif name == "_ezpickle_kwargs" and "render_mode" in value:
-            attributes[name] = {**value, "render_mode": None}
-        elif name in layer.not_state:
-            attributes[name] = value
-        else:
-            attributes[name] = capture_attribute(capture, layer.env, name, value)
-    return attributes
+        layer = next((layer for layer in left_out if layer.name == theirs.name), None)
+        left_out = [other for other in left_out if other is not layer]
+        found.append(layer)
+    return found
 
 
-def _restore_into_clone(restore: Restore, made: Any, attributes: dict[str, Any]) -> None:
-    values = {name: restore_attribute(restore, made, name, value) for name, value in attributes.items()}
-    set_attributes(made, values)
+def check(layers: Sequence[Layer], captured: Sequence[CapturedLayer]) -> None:
+    """Refuse the state of other layers.
+
+    :param layers: of an environment.
+    :param captured: captured layers.
+    :raises SnapshotMismatchError: names the difference.
+    """
+    if len(layers) == len(captured) and all(map(_is_counterpart, layers, captured)):
+        return
+    ours = [layer.name for layer in layers if not layer.left_out]
+    theirs = [layer.name for layer in captured if not layer.left_out]
+    if ours[-1] != theirs[-1]:
+        raise SnapshotMismatchError(f"The snapshot is of a {theirs[-1]}, this environment is a {ours[-1]}.")
+    if ours != theirs:
+        raise SnapshotMismatchError(
+            "The wrappers differ, outermost first: "
+            f"{_short(theirs)} in the snapshot, {_short(ours)} around this environment."
+        )
+    _check_left_out(layers, captured)
+
+
+def _is_alike(layer: Layer, captured: CapturedLayer) -> bool:
+    return layer.name == captured.name
+
+
+def _is_counterpart(layer: Layer, captured: CapturedLayer) -> bool:
+    return _is_alike(layer, captured) and (not layer.monitor or captured.own is not None)
+
+
+def _check_left_out(layers: Sequence[Layer], captured: Sequence[CapturedLayer]) -> None:
+    """Refuse a state without what a ``Monitor`` remembers, or where what was set on a layer would be lost."""
+    pairs = list(zip(pair(layers, captured), captured, strict=True))
+    own = {id(layer.env): captured.own for layer, captured in pairs if layer is not None}
+    for layer in layers:
+        if layer.monitor and own.get(id(layer.env)) is None:
+            raise SnapshotMismatchError(
+                "This environment has a Monitor, and the snapshot is of one without: the episode in progress "
+                "that the Monitor should continue is not in it. Restore it into a clone() instead."
+            )
+        if layer.left_out and id(layer.env) not in own:
+            values = attributes_of(layer.env)
+            others = {name: values[name] for name in values if name not in layer.not_state}
+            _refuse_lost(layer.name, others, "this environment has a {}, and the snapshot is of one without")
+    for found, theirs in pairs:
+        if found is None:
+            others = theirs.attributes or {}
+            _refuse_lost(theirs.name, others, "the snapshot is of one with a {}, and this has none")
+
+
+def _refuse_lost(name: str, attributes: dict[str, Any], what: str) -> None:
+    lost = sorted(name for name, value in attributes.items() if value is not None)
+    if lost:
+        raise SnapshotMismatchError(
+            f"The wrappers differ: {what.format(_short([name]))}, on which others have set {', '.join(lost)}."
+        )
+
+
+def _short(names: list[str]) -> str:
+    return " > ".join(name.rpartition(".")[2] for name in names)
