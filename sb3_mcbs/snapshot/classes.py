@@ -206,14 +206,12 @@ class ClassHandler:
     name = "class"
 
     def capture(self, capture: Capture, obj: type) -> Any:
-        members = []
-        for name, member in _members(obj):
-            try:
-                members.append((name, tuple(capture(part) for part in _parts(member))))
-            except SnapshotUnsupportedError as error:
-                error.path.insert(0, f" ({name} of the class {obj.__qualname__})")
-                raise
-        return ClassName(obj), tuple(capture(base) for base in obj.__bases__), tuple(members)
+        path = " ({} of the class {})"
+        members = tuple(
+            (name, tuple(capture.part(part, path, name, obj.__qualname__) for part in _parts(member)))
+            for name, member in _members(obj)
+        )
+        return ClassName(obj), tuple(capture(base) for base in obj.__bases__), members
 
     def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
         name, bases, members = payload

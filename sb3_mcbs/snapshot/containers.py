@@ -4,7 +4,6 @@ import operator
 from collections import deque
 from typing import Any
 
-from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
 from sb3_mcbs.snapshot.object_graph import ATOMIC_CLASSES, MISSING, Capture, Ref, Restore
 
 
@@ -104,14 +103,7 @@ def capture_items(capture: Capture, items: Any) -> tuple[Any, ...]:
     """
     if ATOMIC_CLASSES.issuperset(map(type, items)):
         return tuple(items)
-    captured = []
-    for place, item in enumerate(items):
-        try:
-            captured.append(capture(item))
-        except SnapshotUnsupportedError as error:
-            error.path.insert(0, f"[{place}]")
-            raise
-    return tuple(captured)
+    return tuple([capture.part(item, "[{}]", place) for place, item in enumerate(items)])
 
 
 class DictHandler:
@@ -120,14 +112,10 @@ class DictHandler:
     name = "dict"
 
     def capture(self, capture: Capture, obj: dict[Any, Any]) -> Any:
-        captured = []
-        for key, value in obj.items():
-            try:
-                captured.append((capture(key), capture(value)))
-            except SnapshotUnsupportedError as error:
-                error.path.insert(0, f"[{key!r}]")
-                raise
-        return tuple(captured)
+        path = "[{!r}]"
+        return tuple(
+            [(capture.part(key, path, key), capture.part(value, path, key)) for key, value in obj.items()]
+        )
 
     def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
         made: dict[Any, Any] = {}

@@ -93,13 +93,9 @@ class FunctionHandler:
     def capture(self, capture: Capture, obj: types.FunctionType) -> Any:
         if not is_own(obj):
             return FunctionName(obj), capture.attempt(*(obj.__closure__ or ())) or (), None
-        cells = []
-        for name, cell in zip(obj.__code__.co_freevars, obj.__closure__ or (), strict=True):
-            try:
-                cells.append(capture(cell))
-            except SnapshotUnsupportedError as error:
-                error.path.insert(0, f" (variable {name} of {obj.__qualname__})")
-                raise
+        variables = zip(obj.__code__.co_freevars, obj.__closure__ or (), strict=True)
+        path = " (variable {} of {})"
+        cells = [capture.part(cell, path, name, obj.__qualname__) for name, cell in variables]
         return FunctionName(obj), tuple(cells), _capture_extras(capture, obj)
 
     def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
@@ -152,15 +148,12 @@ def _extras(function: types.FunctionType) -> Extras:
 
 def _capture_extras(capture: Capture, function: types.FunctionType) -> Extras:
     defaults, keywords, attributes = _extras(function)
-    try:
-        return (
-            capture(defaults),
-            capture(keywords),
-            tuple((name, capture(value)) for name, value in attributes),
-        )
-    except SnapshotUnsupportedError as error:
-        error.path.insert(0, f" (default or attribute of {function.__qualname__})")
-        raise
+    where = " (default or attribute of {})", function.__qualname__
+    return (
+        capture.part(defaults, *where),
+        capture.part(keywords, *where),
+        tuple((name, capture.part(value, *where)) for name, value in attributes),
+    )
 
 
 def _restore_extras(

@@ -195,10 +195,7 @@ def capture_attribute(capture: Capture, env: Any, name: str, value: Any) -> Any:
     :raises SnapshotUnsupportedError: names the attribute.
     """
     try:
-        return capture(value)
-    except SnapshotUnsupportedError as error:
-        error.path.insert(0, f"{type(env).__name__}.{name}")
-        raise
+        return capture.part(value, "{}.{}", type(env).__name__, name)
     except RecursionError as error:
         too_deep = SnapshotUnsupportedError("objects in it hold each other too many levels deep")
         too_deep.path.append(f"{type(env).__name__}.{name}")

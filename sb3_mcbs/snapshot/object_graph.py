@@ -123,6 +123,20 @@ class Capture:
             ) from error
         return ref
 
+    def part(self, value: Any, path: str, *names: Any) -> Any:
+        """Return a captured value that is part of an object.
+
+        :param value: the part.
+        :param path: where in the object it is, for an error: a format string.
+        :param names: the fields of ``path``.
+        :raises SnapshotUnsupportedError: names the part.
+        """
+        try:
+            return self(value)
+        except SnapshotUnsupportedError as error:
+            error.path.insert(0, path.format(*names))
+            raise
+
     def owner_of(self, part: Any, obj: Any) -> Ref | None:
         """Return the node that a part was captured with; None if an object is the first to have it.
 

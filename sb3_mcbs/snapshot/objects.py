@@ -13,7 +13,15 @@ from typing import Any, NamedTuple
 
 from sb3_mcbs.snapshot.containers import TupleHandler, capture_items, refill_dict
 from sb3_mcbs.snapshot.errors import SnapshotError, SnapshotUnsupportedError
-from sb3_mcbs.snapshot.object_graph import MISSING, Capture, Ref, Restore, cannot_be_made, class_name
+from sb3_mcbs.snapshot.object_graph import (
+    ATOMIC_CLASSES,
+    MISSING,
+    Capture,
+    Ref,
+    Restore,
+    cannot_be_made,
+    class_name,
+)
 
 
 class ObjectHandler:
@@ -47,16 +55,13 @@ def capture_content(capture: Capture, obj: Any, leave_out: frozenset[str] = froz
     :param leave_out: names of attributes that are not state.
     :return: names and captured values.
     """
-    attributes = []
-    for name, value in attributes_of(obj).items():
-        if name in leave_out:
-            continue
-        try:
-            attributes.append((name, capture(value)))
-        except SnapshotUnsupportedError as error:
-            error.path.insert(0, f".{name}")
-            raise
-    return tuple(attributes)
+    return tuple(
+        [
+            (name, value if type(value) in ATOMIC_CLASSES else capture.part(value, ".{}", name))
+            for name, value in attributes_of(obj).items()
+            if name not in leave_out
+        ]
+    )
 
 
 def restore_content(

@@ -33,10 +33,10 @@ from sb3_mcbs.snapshot.weak import check_held
 _NEEDS_RENDERING = "gymnasium.wrappers.transform_observation.AddRenderObservation"
 
 
-class Kept(NamedTuple):
-    """A captured state, and the very objects that it was captured of.
+class State(NamedTuple):
+    """The captured state of a stack of layers.
 
-    :param layers: the captured layers.
+    :param layers: the captured layers, outermost first.
     :param nodes: the nodes that their values refer to.
     :param objects: what each node was made of.
     """
@@ -84,7 +84,7 @@ class Stack:
     @contextlib.contextmanager
     def bare(self) -> Iterator[None]:
         """Monitor, record and draw nothing while it is entered. After that, all is as it was."""
-        kept = self.keep(monitor=False)
+        state = self.capture(monitor=False)
         left_out = [layer for layer in self.layers if layer.left_out]
         classes = [type(layer.env) for layer in left_out]
         base = self.layers[-1].env
@@ -94,16 +94,16 @@ class Stack:
                 layer.env.__class__ = stand_in(layer.cls)
             if draws is not None:
                 base.render_mode = None
-            if any(_is_method_of(left_out, obj) for obj in kept.objects):
+            if any(_is_method_of(left_out, obj) for obj in state.objects):
                 # Whoever holds such a method gets that of the stand-in.
-                self.restore(kept.layers, kept.nodes, "restore")
+                self.restore(state.layers, state.nodes)
             yield
         finally:
             for layer, cls in zip(left_out, classes, strict=True):
                 layer.env.__class__ = cls
             if draws is not None:
                 base.render_mode = draws
-            self.put_back(kept)
+            self.put_back(state)
 
     @property
     def incomplete_clones(self) -> bool:
@@ -116,18 +116,8 @@ class Stack:
         adapted = [layer.env for layer in self.layers if layer.adapter is not None]
         return [*(self._watched or ()), *adapted]
 
-    def capture(self, monitor: bool = True) -> tuple[tuple[CapturedLayer, ...], tuple[Node, ...]]:
+    def capture(self, monitor: bool = True) -> State:
         """Capture the state.
-
-        :param monitor: whether what a ``Monitor`` holds is captured.
-        :return: the captured layers, outermost first, and the nodes that their values refer to.
-        :raises SnapshotUnsupportedError: if a layer holds something that cannot be captured.
-        """
-        kept = self.keep(monitor)
-        return kept.layers, kept.nodes
-
-    def keep(self, monitor: bool) -> Kept:
-        """Capture the state, for :meth:`put_back`.
 
         :param monitor: whether what a ``Monitor`` holds is captured.
         :raises SnapshotUnsupportedError: if a layer holds something that cannot be captured.
@@ -140,28 +130,28 @@ class Stack:
                 break
         check_memory(capture)
         check_held(capture, captured)
-        return Kept(captured, tuple(capture.nodes), capture.objects)
+        return State(captured, tuple(capture.nodes), capture.objects)
 
-    def put_back(self, kept: Kept) -> None:
+    def put_back(self, state: State) -> None:
         """Put the layers into a captured state, with the objects that they held then.
 
         Somebody else may hold those, too: settings that several environments share, a model.
 
-        :param kept: of :meth:`keep`.
+        :param state: of :meth:`capture`.
         """
-        self._restore(kept.layers, kept.nodes, "restore", kept.objects)
+        self.restore(state.layers, state.nodes, originals=state.objects)
         self.find_simulators()
 
-    def become(self, kept: Kept, shares: bool) -> None:
+    def become(self, state: State, shares: bool) -> None:
         """Put the layers of a copy that was made otherwise into the state of the original.
 
-        :param kept: of the original's :meth:`keep`.
+        :param state: of the original.
         :param shares: whether the copy may have functions and classes of the original, as deep copies have.
         """
-        own = [obj for obj in kept.objects if shares and issubclass(type(obj), type | types.FunctionType)]
+        own = [obj for obj in state.objects if shares and issubclass(type(obj), type | types.FunctionType)]
         foreign = frozenset(id(obj) for obj in own if isinstance(obj, type) or is_own(obj))
         self.capture()  # finds the simulators
-        self._restore(kept.layers, kept.nodes, "restore", None, foreign)
+        self.restore(state.layers, state.nodes, foreign=foreign)
 
     def find_simulators(self) -> None:
         """Watch the simulators that are there now: a reset of the environment may exchange its own."""
@@ -189,33 +179,61 @@ class Stack:
             if watch is not None:
                 self.watches.append(watch)
 
-    def check(self, captured: tuple[CapturedLayer, ...]) -> None:
+    def check(self, captured: Sequence[CapturedLayer]) -> None:
         """Refuse the state of other layers.
 
         :param captured: captured layers.
         :raises SnapshotMismatchError: names the difference.
         """
-        check(self.layers, captured)
+        if len(self.layers) == len(captured) and all(map(_is_counterpart, self.layers, captured)):
+            return
+        ours = [layer.name for layer in self.layers if not layer.left_out]
+        theirs = [layer.name for layer in captured if not layer.left_out]
+        if ours[-1] != theirs[-1]:
+            raise SnapshotMismatchError(
+                f"The snapshot is of a {theirs[-1]}, this environment is a {ours[-1]}."
+            )
+        if ours != theirs:
+            raise SnapshotMismatchError(
+                "The wrappers differ, outermost first: "
+                f"{_short(theirs)} in the snapshot, {_short(ours)} around this environment."
+            )
+        _check_left_out(self.layers, self._pair(captured), captured)
 
-    def restore(self, captured: tuple[CapturedLayer, ...], nodes: tuple[Node, ...], rng: RngMode) -> None:
+    def _pair(self, captured: Sequence[CapturedLayer]) -> list[Layer | None]:
+        """Find for each captured layer the one to restore; None for one that may be missing, and is."""
+        if len(self.layers) == len(captured) and all(map(_is_alike, self.layers, captured)):
+            return list(self.layers)
+        kept = iter([layer for layer in self.layers if not layer.left_out])
+        left_out = [layer for layer in self.layers if layer.left_out]
+        found: list[Layer | None] = []
+        for theirs in captured:
+            if not theirs.left_out:
+                found.append(next(kept))
+                continue
+            layer = next((layer for layer in left_out if layer.name == theirs.name), None)
+            left_out = [other for other in left_out if other is not layer]
+            found.append(layer)
+        return found
+
+    def restore(
+        self,
+        captured: Sequence[CapturedLayer],
+        nodes: tuple[Node, ...],
+        rng: RngMode = "restore",
+        originals: list[Any] | None = None,
+        foreign: frozenset[int] = frozenset(),
+    ) -> None:
         """Put the layers into a captured state.
 
         :param captured: captured layers; :meth:`check` has passed.
         :param nodes: the nodes that their values refer to.
         :param rng: what becomes of random generators.
+        :param originals: the objects that the nodes were made of, if those are to be put back themselves.
+        :param foreign: ids of functions and classes that are there and belong to another environment.
         :raises SnapshotMismatchError: if the state does not fit; nothing has been changed then.
         """
-        self._restore(captured, nodes, rng, None)
-
-    def _restore(
-        self,
-        captured: tuple[CapturedLayer, ...],
-        nodes: tuple[Node, ...],
-        rng: RngMode,
-        originals: list[Any] | None,
-        foreign: frozenset[int] = frozenset(),
-    ) -> None:
-        layers = pair(self.layers, captured)
+        layers = self._pair(captured)
         known = [layer.env if layer is not None else None for layer in layers]
         for place in reversed(range(len(known) - 1)):
             if known[place] is None:
@@ -253,7 +271,7 @@ class Stack:
             for place, layer in reversed([*enumerate(self.layers)])
             if layer.adapter is None
         }
-        if not self.incomplete_clones:  # those are completed by what keep() has checked
+        if not self.incomplete_clones:  # those are completed by what capture() has checked
             check_held(cloner.capture, [*classes, *captured.values()])
         cloner.make_simulators()
         for place, attributes in captured.items():
@@ -268,48 +286,6 @@ def _is_method_of(layers: list[Layer], obj: Any) -> bool:
     return type(obj) is types.MethodType and any(obj.__self__ is layer.env for layer in layers)
 
 
-def pair(layers: Sequence[Layer], captured: Sequence[CapturedLayer]) -> list[Layer | None]:
-    """Find for each captured layer the one to restore; None for one that may be missing, and is.
-
-    :param layers: of an environment.
-    :param captured: captured layers; :func:`check` has passed.
-    """
-    if len(layers) == len(captured) and all(map(_is_alike, layers, captured)):
-        return list(layers)
-    kept = iter([layer for layer in layers if not layer.left_out])
-    left_out = [layer for layer in layers if layer.left_out]
-    found: list[Layer | None] = []
-    for theirs in captured:
-        if not theirs.left_out:
-            found.append(next(kept))
-            continue
-        layer = next((layer for layer in left_out if layer.name == theirs.name), None)
-        left_out = [other for other in left_out if other is not layer]
-        found.append(layer)
-    return found
-
-
-def check(layers: Sequence[Layer], captured: Sequence[CapturedLayer]) -> None:
-    """Refuse the state of other layers.
-
-    :param layers: of an environment.
-    :param captured: captured layers.
-    :raises SnapshotMismatchError: names the difference.
-    """
-    if len(layers) == len(captured) and all(map(_is_counterpart, layers, captured)):
-        return
-    ours = [layer.name for layer in layers if not layer.left_out]
-    theirs = [layer.name for layer in captured if not layer.left_out]
-    if ours[-1] != theirs[-1]:
-        raise SnapshotMismatchError(f"The snapshot is of a {theirs[-1]}, this environment is a {ours[-1]}.")
-    if ours != theirs:
-        raise SnapshotMismatchError(
-            "The wrappers differ, outermost first: "
-            f"{_short(theirs)} in the snapshot, {_short(ours)} around this environment."
-        )
-    _check_left_out(layers, captured)
-
-
 def _is_alike(layer: Layer, captured: CapturedLayer) -> bool:
     return layer.name == captured.name
 
@@ -318,9 +294,11 @@ def _is_counterpart(layer: Layer, captured: CapturedLayer) -> bool:
     return _is_alike(layer, captured) and (not layer.monitor or captured.own is not None)
 
 
-def _check_left_out(layers: Sequence[Layer], captured: Sequence[CapturedLayer]) -> None:
+def _check_left_out(
+    layers: Sequence[Layer], paired: Sequence[Layer | None], captured: Sequence[CapturedLayer]
+) -> None:
     """Refuse a state without what a ``Monitor`` remembers, or where what was set on a layer would be lost."""
-    pairs = list(zip(pair(layers, captured), captured, strict=True))
+    pairs = list(zip(paired, captured, strict=True))
     own = {id(layer.env): captured.own for layer, captured in pairs if layer is not None}
     for layer in layers:
         if layer.monitor and own.get(id(layer.env)) is None:

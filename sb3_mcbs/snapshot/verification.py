@@ -23,7 +23,7 @@ from sb3_mcbs.snapshot.object_graph import private_copy
 from sb3_mcbs.snapshot.objects import attributes_of
 from sb3_mcbs.snapshot.registry import SnapshotAdapter, find_adapter
 from sb3_mcbs.snapshot.spaces import random_action
-from sb3_mcbs.snapshot.stack import Stack
+from sb3_mcbs.snapshot.stack import Stack, State
 
 logger = logging.getLogger("sb3_mcbs")
 
@@ -109,16 +109,16 @@ class CheckedEnvironment:
         self._clone = clone
         self._wrapper = wrapper
 
-    def capture(self) -> Any:
+    def capture(self) -> State:
         """Return its state."""
         return self._named("capturing its state", lambda: self.stack.capture(monitor=False))
 
-    def put_back(self, state: Any) -> None:
+    def put_back(self, state: State) -> None:
         """Put it into a captured state.
 
         :param state: of :meth:`capture`.
         """
-        self._named("putting its state back", lambda: self.stack.restore(state[0], state[1], "restore"))
+        self._named("putting its state back", lambda: self.stack.restore(state.layers, state.nodes))
 
     def copy(self) -> "CheckedEnvironment":
         """Return an independent copy in the present state."""

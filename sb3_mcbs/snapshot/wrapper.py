@@ -125,8 +125,7 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
     def __getstate__(self) -> dict[str, Any]:
         state = {name: value for name, value in vars(self).items() if name != _STACK}
         if self.last_observation is not None:
-            kept = self._stack.keep(monitor=True)
-            state[_KEPT] = kept._replace(objects=[])
+            state[_KEPT] = self._stack.capture()._replace(objects=[])
         return state
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -140,7 +139,7 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
         attributes = {name: value for name, value in vars(self).items() if name != _STACK}
         vars(made).update(deepcopy(attributes, memo), **{_STACK: None})
         if self.last_observation is not None:
-            made._stack.become(self._stack.keep(monitor=True), shares=True)
+            made._stack.become(self._stack.capture(), shares=True)
         return made
 
     @property
@@ -230,8 +229,8 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
             cannot be captured.
         """
         self.verify()
-        layers, nodes = self._stack.capture(monitor)
-        return Snapshot(layers, nodes, self._spaces, private_copy(self.last_observation))
+        state = self._stack.capture(monitor)
+        return Snapshot(state.layers, state.nodes, self._spaces, private_copy(self.last_observation))
 
     def restore(self, snapshot: Snapshot, rng: RngMode = "restore") -> None:
         """Put the environment back into a captured state.
@@ -301,6 +300,6 @@ def _clone(stack: Stack) -> tuple[Stack, SnapshotEnvWrapper]:
     copy = SnapshotEnvWrapper(stack.clone(), verify=False)
     copy._is_copy = True
     if stack.incomplete_clones:
-        layers, nodes = stack.capture(monitor=False)
-        copy._stack.restore(layers, nodes, "restore")
+        state = stack.capture(monitor=False)
+        copy._stack.restore(state.layers, state.nodes)
     return copy._stack, copy
