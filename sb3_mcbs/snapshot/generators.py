@@ -3,13 +3,13 @@
 import functools
 import random
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 
-from sb3_mcbs.snapshot.object_graph import MISSING, Capture, Ref, Restore
+from sb3_mcbs.snapshot.object_graph import MISSING, Capture, Node, Ref, Restore
 
 _U64 = 2**64
 _CLASSES = (np.random.Generator, np.random.RandomState, np.random.BitGenerator, random.Random)
@@ -106,6 +106,14 @@ class SeedsHandler:
         elif reused:
             restore.do_then(_set_seeds, sequence, _read_seeds(sequence))
         return sequence
+
+
+def states_in(nodes: Iterable[Node]) -> list[Any]:
+    """Return the states of the random generators that were captured.
+
+    :param nodes: of a snapshot.
+    """
+    return [payload[1:] for kind, payload in nodes if kind == GeneratorHandler.name]
 
 
 def restore_np_random(restore: Restore, value: Any, attributes: dict[str, Any]) -> None:

@@ -181,19 +181,11 @@ def capture_attributes(
             if captured is not None:
                 attributes[name] = captured[0]
         else:
-            attributes[name] = capture_attribute(capture, env, name, value)
+            attributes[name] = _capture_attribute(capture, env, name, value)
     return attributes
 
 
-def capture_attribute(capture: Capture, env: Any, name: str, value: Any) -> Any:
-    """Capture one attribute of a layer.
-
-    :param capture: what captures it.
-    :param env: the wrapper or environment.
-    :param name: of the attribute.
-    :param value: of the attribute.
-    :raises SnapshotUnsupportedError: names the attribute.
-    """
+def _capture_attribute(capture: Capture, env: Any, name: str, value: Any) -> Any:
     try:
         return capture.part(value, "{}.{}", type(env).__name__, name)
     except RecursionError as error:
@@ -202,16 +194,7 @@ def capture_attribute(capture: Capture, env: Any, name: str, value: Any) -> Any:
         raise too_deep from error
 
 
-def restore_attribute(restore: Restore, env: Any, name: str, value: Any, current: Any = MISSING) -> Any:
-    """Plan to put back one attribute of a layer, and return its value.
-
-    :param restore: keeps the plan.
-    :param env: the wrapper or environment.
-    :param name: of the attribute.
-    :param value: its captured value.
-    :param current: what the attribute is now.
-    :raises SnapshotUnsupportedError: names the attribute.
-    """
+def _restore_attribute(restore: Restore, env: Any, name: str, value: Any, current: Any = MISSING) -> Any:
     try:
         return restore(value, current)
     except SnapshotUnsupportedError as error:
@@ -238,7 +221,7 @@ def restore_attributes(
             if there is not None and stays(there):  # such as a window that was opened since
                 del values[name]
         elif type(value) is Ref and name != "_np_random":
-            values[name] = restore_attribute(restore, env, name, value, have.get(name, MISSING))
+            values[name] = _restore_attribute(restore, env, name, value, have.get(name, MISSING))
             if values[name] is MISSING:
                 del values[name]
     # Gymnasium keeps it on the class until it is first needed.
@@ -273,10 +256,10 @@ def capture_for_clone(capture: Capture, layer: Layer) -> dict[str, Any]:
             attributes[name] = None
         elif name == "_ezpickle_kwargs" and "render_mode" in value:
             attributes[name] = {**value, "render_mode": None}
-        elif name in layer.not_state:
+        elif name in layer.not_state or type(value) in ATOMIC_CLASSES:
             attributes[name] = value
         else:
-            attributes[name] = capture_attribute(capture, layer.env, name, value)
+            attributes[name] = _capture_attribute(capture, layer.env, name, value)
     return attributes
 
 
@@ -287,7 +270,10 @@ def restore_into_clone(restore: Restore, made: Any, attributes: dict[str, Any]) 
     :param made: the clone of the layer, which has no attributes yet.
     :param attributes: of :func:`capture_for_clone`.
     """
-    values = {name: restore_attribute(restore, made, name, value) for name, value in attributes.items()}
+    values = {
+        name: _restore_attribute(restore, made, name, value) if type(value) is Ref else value
+        for name, value in attributes.items()
+    }
     set_attributes(made, values)
 
 

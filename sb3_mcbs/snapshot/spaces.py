@@ -21,16 +21,13 @@ _SMALL = 1024
 
 def _parts_of(space: spaces.Space) -> list[spaces.Space]:
     """Return a space and the spaces in it."""
-    if isinstance(space, spaces.Box | spaces.Discrete | spaces.MultiBinary):
-        return [space]
-    parts = [space]
-    for inner in _inner(space):
-        parts.extend(_parts_of(inner))
-    return parts
+    return [space, *(part for inner in _inner(space) for part in _parts_of(inner))]
 
 
 def _inner(space: spaces.Space) -> list[spaces.Space]:
     """Return the spaces right within a space."""
+    if isinstance(space, spaces.Box | spaces.Discrete | spaces.MultiBinary):
+        return []
     found = []
     for value in vars(space).values():
         items = value.values() if isinstance(value, dict) else value
@@ -48,8 +45,7 @@ class _Known:
         self._values = _without_generator(space)
         self._bounds = [value for value in self._values if _is_small(value)]
         self._contents = [bounds.tobytes() for bounds in self._bounds]
-        is_leaf = isinstance(space, spaces.Box | spaces.Discrete | spaces.MultiBinary)
-        self._inner = None if is_leaf else [(inner, _definition_of(inner)) for inner in _inner(space)]
+        self._inner = [(inner, _definition_of(inner)) for inner in _inner(space)]
 
     def holds(self, space: spaces.Space) -> bool:
         """Return whether the definition is still that of the space."""
@@ -58,8 +54,6 @@ class _Known:
             return False
         if self._contents != [bounds.tobytes() for bounds in self._bounds]:
             return False
-        if self._inner is None:
-            return True
         inner = _inner(space)
         return len(inner) == len(self._inner) and all(
             one is other and _definition_of(one) is definition
