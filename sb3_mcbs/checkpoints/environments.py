@@ -15,8 +15,8 @@ from sb3_mcbs.checkpoints.errors import CheckpointError
 from sb3_mcbs.checkpoints.files import file_of, read_written, write_again
 from sb3_mcbs.checkpoints.names import known_names
 from sb3_mcbs.snapshot import Snapshot, SnapshotEnvWrapper, SnapshotError
-from sb3_mcbs.snapshot.pairing import CapturedLayer
-from sb3_mcbs.snapshot.replay import Episode
+from sb3_mcbs.snapshot.layers import CapturedLayer
+from sb3_mcbs.snapshot.replay import RecordedEpisode
 
 _Generators = dict[str, Any]
 
@@ -131,7 +131,7 @@ def _with_state(cls: Any, state: dict[str, Any]) -> Any:
     return made
 
 
-register_state(Episode, tuple, lambda data: Episode(*data))
+register_state(RecordedEpisode, tuple, lambda data: RecordedEpisode(*data))
 try:
     from sb3_mcbs.snapshot.mujoco import DataState, ModelState
 except ImportError:  # MuJoCo is an optional part of Gymnasium

@@ -10,15 +10,8 @@ from sb3_mcbs.snapshot import SnapshotMismatchError, SnapshotUnsupportedError
 from sb3_mcbs.snapshot.arrays import ArrayHandler
 from sb3_mcbs.snapshot.handlers import HANDLERS as ENVIRONMENT_HANDLERS
 from sb3_mcbs.snapshot.handlers import handler_of as environment_handler_of
-from sb3_mcbs.snapshot.object_graph import Capture, Copier, Restore, TypeHandler, class_name
+from sb3_mcbs.snapshot.object_graph import Capture, Restore, TypeHandler, class_name
 from sb3_mcbs.snapshot.objects import ReducedHandler
-
-
-class _NotCopied:
-    """The part of a handler that checkpoints never use."""
-
-    def copy(self, copier: Copier, obj: Any) -> Any:
-        raise NotImplementedError("agents are not copied")
 
 
 class OwnedArrayHandler(ArrayHandler):
@@ -38,7 +31,7 @@ class CalledHandler(ReducedHandler):
         return super().capture(capture, obj)
 
 
-class TensorHandler(_NotCopied):
+class TensorHandler:
     """Tensors: put back in place where there is one of the same shape."""
 
     name = "tensor"
@@ -65,7 +58,7 @@ def _copy_into(tensor: th.Tensor, saved: th.Tensor) -> None:
         tensor.copy_(saved)
 
 
-class OptimizerHandler(_NotCopied):
+class OptimizerHandler:
     """Optimisers: what their ``state_dict`` says."""
 
     name = "optimizer"
@@ -78,7 +71,7 @@ class OptimizerHandler(_NotCopied):
         return current
 
 
-class NamedTupleHandler(_NotCopied):
+class NamedTupleHandler:
     """Named tuples."""
 
     name = "namedtuple"
@@ -91,7 +84,7 @@ class NamedTupleHandler(_NotCopied):
         return tuple.__new__(cls, [restore(item) for item in items])
 
 
-class NetworkHandler(_NotCopied):
+class NetworkHandler:
     """Networks: those of the policy are components of the run, and never captured themselves."""
 
     name = "network"
@@ -103,7 +96,7 @@ class NetworkHandler(_NotCopied):
         raise SnapshotMismatchError("the checkpoint holds a network outside of the policy")
 
 
-class RegisteredHandler(_NotCopied):
+class RegisteredHandler:
     """Objects whose class registered a pair of functions."""
 
     name = "registered"

@@ -27,7 +27,7 @@ from sb3_mcbs.checkpoints.handlers import HANDLERS, handler_of
 from sb3_mcbs.checkpoints.names import known_names
 from sb3_mcbs.models import WorkerEnvironments
 from sb3_mcbs.snapshot import SnapshotEnvWrapper, SnapshotError, SnapshotUnsupportedError
-from sb3_mcbs.snapshot.attributes import capture_attributes, restore_attributes
+from sb3_mcbs.snapshot.layers import capture_attributes, restore_attributes
 from sb3_mcbs.snapshot.object_graph import Capture, Ref, Restore, class_name
 
 RUN = "run"

@@ -19,7 +19,7 @@ from sb3_mcbs.snapshot import (
     SnapshotEnvWrapper,
     SnapshotMismatchError,
 )
-from sb3_mcbs.snapshot.global_generators import isolated_globals
+from sb3_mcbs.snapshot.generators import isolated_globals
 from sb3_mcbs.types import ForwardModelError
 
 

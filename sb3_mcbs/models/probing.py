@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sb3_mcbs.snapshot import SnapshotAdapter, SnapshotEnvWrapper, SnapshotUnsupportedError
-from sb3_mcbs.snapshot.global_generators import global_states, isolated_globals
+from sb3_mcbs.snapshot.generators import global_states, isolated_globals, states_in
 from sb3_mcbs.snapshot.registry import find_adapter
 from sb3_mcbs.snapshot.spaces import random_action, values_of
 
@@ -44,8 +44,7 @@ def _content(value: np.ndarray) -> Any:
 
 def _own_generators(env: SnapshotEnvWrapper) -> list[str]:
     """The states of all generators that are captured with an environment."""
-    nodes = env.snapshot(monitor=False).nodes
-    return [_comparable(payload[2:]) for kind, payload in nodes if kind == "generator"]
+    return [_comparable(state) for state in states_in(env.snapshot(monitor=False).nodes)]
 
 
 def _draws_elsewhere(env: SnapshotEnvWrapper) -> bool:

@@ -2,9 +2,9 @@
 
 from sb3_mcbs.snapshot.bullet import BulletAdapter, ServerAdapter, is_server
 from sb3_mcbs.snapshot.bullet_handles import uses_bullet
+from sb3_mcbs.snapshot.divergence import SIMULATION_DIVERGED
 from sb3_mcbs.snapshot.dm_control import PhysicsAdapter, is_physics
 from sb3_mcbs.snapshot.errors import SnapshotError, SnapshotMismatchError, SnapshotUnsupportedError
-from sb3_mcbs.snapshot.faults import SIMULATION_DIVERGED
 from sb3_mcbs.snapshot.registry import SnapshotAdapter, register_adapter
 from sb3_mcbs.snapshot.replay import Box2DAdapter, ReplayAdapter, renew_world, uses_box2d
 from sb3_mcbs.snapshot.wrapper import Snapshot, SnapshotEnvWrapper

@@ -7,7 +7,7 @@ from typing import Any, Literal
 import numpy as np
 
 from sb3_mcbs.snapshot.errors import SnapshotMismatchError, SnapshotUnsupportedError
-from sb3_mcbs.snapshot.object_graph import Capture, Copier, Restore
+from sb3_mcbs.snapshot.object_graph import Capture, Restore
 from sb3_mcbs.snapshot.tensors import bytes_of, is_tensor
 
 
@@ -68,33 +68,6 @@ class ArrayHandler:
         restore.do_then(_write, current, content)
         return current
 
-    def copy(self, copier: Copier, obj: np.ndarray) -> Any:
-        base, layout = (None, None) if obj.base is None else _base_and_layout(obj)
-        if layout is not None:
-            return _view_of(copier.copy(base), layout)
-        if obj.dtype.hasobject:
-            made = copier.enter(obj, np.empty(obj.shape, obj.dtype, _order(obj)))
-            for place, item in zip(np.ndindex(obj.shape), obj.ravel().tolist(), strict=True):
-                made[place] = copier.copy(item)
-            return made
-        if _is_borrowed(obj):
-            return counterpart(copier, obj)
-        return _with_flag(obj.copy(order="K"), obj.flags.writeable)
-
-
-def counterpart(copier: Copier, view: Any) -> Any:
-    """Find in the copied simulators what corresponds to a view into one of the originals.
-
-    :param copier: has copied them.
-    :param view: an array, or another object that a simulator hands out.
-    :raises SnapshotUnsupportedError: if it belongs to none of them.
-    """
-    for adapter, old, new in copier.adapted:
-        found = adapter.clone_view(old, new, view)
-        if found is not None:
-            return found
-    raise SnapshotUnsupportedError("it is a view into memory that belongs to nothing that is copied")
-
 
 class BytearrayHandler:
     """Bytes that can be changed."""
@@ -109,9 +82,6 @@ class BytearrayHandler:
             restore.do_then(current.__setitem__, slice(None), payload)
             return current
         return bytearray(payload)
-
-    def copy(self, copier: Copier, obj: bytearray) -> Any:
-        return bytearray(obj)
 
 
 def _owner(view: np.ndarray) -> Any:

@@ -14,13 +14,11 @@ from collections.abc import Callable
 from typing import Any
 from weakref import WeakSet, finalize
 
-from sb3_mcbs.snapshot.attributes import capture_attributes
 from sb3_mcbs.snapshot.bullet_handles import Handle, is_client
 from sb3_mcbs.snapshot.bullet_recorder import (
     BulletRecorder,
     BulletState,
     end_servers,
-    find_recorder,
     holder_of,
     not_connected,
     recorder_of,
@@ -34,10 +32,10 @@ from sb3_mcbs.snapshot.bullet_world import (
 )
 from sb3_mcbs.snapshot.errors import SnapshotError, SnapshotMismatchError, SnapshotUnsupportedError
 from sb3_mcbs.snapshot.handlers import handler_of
-from sb3_mcbs.snapshot.layers import NOT_STATE, RECORDER
+from sb3_mcbs.snapshot.layers import NOT_STATE, RECORDER, capture_attributes
 from sb3_mcbs.snapshot.object_graph import Capture, Ref
 from sb3_mcbs.snapshot.registry import SnapshotAdapter
-from sb3_mcbs.snapshot.replay import ReplayAdapter, constructor_arguments
+from sb3_mcbs.snapshot.replay import ReplayAdapter, constructor_arguments, find_recorder
 
 _OURS = {RECORDER, "reset", "step", "close"}
 _METHODS = ("auto", "state", "replay")

@@ -9,8 +9,7 @@ from weakref import WeakKeyDictionary
 from sb3_mcbs.snapshot.bullet_handles import Handle, find
 from sb3_mcbs.snapshot.bullet_world import connections, disconnect, is_connected, read_world
 from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
-from sb3_mcbs.snapshot.layers import RECORDER
-from sb3_mcbs.snapshot.replay import Episode, Recorder
+from sb3_mcbs.snapshot.replay import RecordedEpisode, Recorder, find_recorder
 
 
 class BulletState(TypedDict):
@@ -25,9 +24,9 @@ class BulletState(TypedDict):
     """
 
     worlds: tuple[tuple[Any, ...], ...]
-    episode: Episode | None
+    episode: RecordedEpisode | None
     before: tuple[int, int]
-    first: tuple[Episode, tuple[int, int]] | None
+    first: tuple[RecordedEpisode, tuple[int, int]] | None
     names: tuple[str, ...] | None
 
 
@@ -62,7 +61,7 @@ class BulletRecorder(Recorder):
         #: Whether it has never been reset.
         self.unused = True
         self.before = (0, 0)
-        self.first: tuple[Episode, tuple[int, int]] | None = None
+        self.first: tuple[RecordedEpisode, tuple[int, int]] | None = None
         self.latest_clone: Callable[[], Any] = lambda: None
         super().__init__(env, prepare, not_state)
 
@@ -149,7 +148,7 @@ class BulletRecorder(Recorder):
             self._repeat_one(*state["first"])
         self._repeat_one(episode if with_actions else episode._replace(actions=()), state["before"])
 
-    def _repeat_one(self, episode: Episode, needed: tuple[int, int]) -> None:
+    def _repeat_one(self, episode: RecordedEpisode, needed: tuple[int, int]) -> None:
         if len(self.look()) < needed[0] or len(self.clients) < needed[1]:
             # The original had been used when it was wrapped, and its attributes say so.
             self._begin_episode({"seed": 0})
@@ -202,14 +201,6 @@ def end_servers(process: int, servers: set[int]) -> None:
         servers.clear()
 
 
-def find_recorder(env: Any) -> BulletRecorder | None:
-    """Return what records the episodes of an environment, None if nothing does.
-
-    :param env: the environment.
-    """
-    return vars(env).get(RECORDER)
-
-
 def _numbers(servers: tuple[int, ...]) -> list[int]:
     return [int(server) for server in servers]
 
@@ -229,7 +220,7 @@ def recorder_of(env: Any) -> BulletRecorder:
     :param env: the environment.
     :raises SnapshotUnsupportedError: if nothing does.
     """
-    recorder = find_recorder(env)
+    recorder: BulletRecorder | None = find_recorder(env)
     if recorder is None:
         raise SnapshotUnsupportedError(
             f"a {type(env).__name__} simulates with PyBullet, and can be captured only where it is the "

@@ -11,7 +11,7 @@ from typing import Any
 
 from sb3_mcbs.snapshot.errors import SnapshotMismatchError, SnapshotUnsupportedError
 from sb3_mcbs.snapshot.functions import fingerprint
-from sb3_mcbs.snapshot.object_graph import MISSING, Capture, Copier, Restore, class_name
+from sb3_mcbs.snapshot.object_graph import MISSING, Capture, Restore, class_name
 
 #: Members that Python makes itself, and those that only say what a class is.
 _NOT_STATE = frozenset(
@@ -199,9 +199,6 @@ class LocalClassHandler:
     def restore(self, restore: Restore, index: int, payload: ClassName, current: Any) -> Any:
         return current if payload.is_name_of(current) else payload.find()
 
-    def copy(self, copier: Copier, obj: type) -> Any:
-        return obj
-
 
 class ClassHandler:
     """Classes that are made per instance: their attributes, and what their methods close over, are state."""
@@ -209,14 +206,12 @@ class ClassHandler:
     name = "class"
 
     def capture(self, capture: Capture, obj: type) -> Any:
-        members = []
-        for name, member in _members(obj):
-            try:
-                members.append((name, tuple(capture(part) for part in _parts(member))))
-            except SnapshotUnsupportedError as error:
-                error.path.insert(0, f" ({name} of the class {obj.__qualname__})")
-                raise
-        return ClassName(obj), tuple(capture(base) for base in obj.__bases__), tuple(members)
+        path = " ({} of the class {})"
+        members = tuple(
+            (name, tuple(capture.part(part, path, name, obj.__qualname__) for part in _parts(member)))
+            for name, member in _members(obj)
+        )
+        return ClassName(obj), tuple(capture(base) for base in obj.__bases__), members
 
     def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
         name, bases, members = payload
@@ -236,13 +231,6 @@ class ClassHandler:
         for key, parts in members:
             member = vars(template)[key]
             type.__setattr__(made, key, _put_together(member, _restore_parts(restore, parts, (MISSING,) * 3)))
-        return made
-
-    def copy(self, copier: Copier, obj: type) -> Any:
-        made = copier.enter(obj, _blank(obj, tuple(copier.copy(base) for base in obj.__bases__)))
-        for name, member in _members(obj):
-            parts = tuple(copier.copy(part) for part in _parts(member))
-            type.__setattr__(made, name, _put_together(member, parts))
         return made
 
 

@@ -4,12 +4,26 @@ import operator
 from collections import deque
 from typing import Any
 
-from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
-from sb3_mcbs.snapshot.object_graph import ATOMIC_CLASSES, MISSING, Capture, Copier, Ref, Restore
+from sb3_mcbs.snapshot.object_graph import ATOMIC_CLASSES, MISSING, Capture, Ref, Restore
+
+
+class TupleHandler:
+    """Tuples and frozen sets."""
+
+    name = "tuple"
+
+    def capture(self, capture: Capture, obj: Any) -> Any:
+        return type(obj), capture_items(capture, obj)
+
+    def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
+        cls, items = payload
+        parts = _restore_items(restore, items, current)
+        stays = restore.is_original(index, current) and all(map(operator.is_, current, parts))
+        return current if stays else cls(parts)
 
 
 class SequenceHandler:
-    """Lists, tuples, sets and deques."""
+    """Lists, sets and deques."""
 
     name = "sequence"
 
@@ -18,34 +32,25 @@ class SequenceHandler:
 
     def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
         cls, maxlen, items = payload
-        have = current if type(current) in (list, tuple, deque) else ()
-        n_have = len(have)
-        restored = (
-            restore(item, have[place] if place < n_have else MISSING) if type(item) is Ref else item
-            for place, item in enumerate(items)
-        )
-        if cls is tuple or cls is frozenset:
-            parts = list(restored)
-            stays = restore.is_original(index, current) and all(map(operator.is_, current, parts))
-            return current if stays else cls(parts)
         if restore.is_original(index, current):
             restore.memo[index] = current
-            restore.do_then(_refill, current, list(restored))
+            restore.do_then(_refill, current, _restore_items(restore, items, current))
             return current
         made: Any = deque(maxlen=maxlen) if cls is deque else cls()
         restore.memo[index] = made
         if cls is set:
-            return _kept_or_filled(restore, index, made, list(restored), current)
-        made.extend(restored)
+            return _kept_or_filled(restore, index, made, _restore_items(restore, items, current), current)
+        made.extend(_restore_items(restore, items, current))
         return made
 
-    def copy(self, copier: Copier, obj: Any) -> Any:
-        cls = type(obj)
-        if cls is tuple or cls is frozenset:
-            return cls([copier.copy(item) for item in obj])
-        made: Any = copier.enter(obj, deque(maxlen=obj.maxlen) if cls is deque else cls())
-        (made.update if cls is set else made.extend)([copier.copy(item) for item in obj])
-        return made
+
+def _restore_items(restore: Restore, items: tuple[Any, ...], current: Any) -> list[Any]:
+    have = current if type(current) in (list, tuple, deque) else ()
+    n_have = len(have)
+    return [
+        restore(item, have[place] if place < n_have else MISSING) if type(item) is Ref else item
+        for place, item in enumerate(items)
+    ]
 
 
 def _refill(container: Any, items: list[Any]) -> None:
@@ -98,14 +103,7 @@ def capture_items(capture: Capture, items: Any) -> tuple[Any, ...]:
     """
     if ATOMIC_CLASSES.issuperset(map(type, items)):
         return tuple(items)
-    captured = []
-    for place, item in enumerate(items):
-        try:
-            captured.append(capture(item))
-        except SnapshotUnsupportedError as error:
-            error.path.insert(0, f"[{place}]")
-            raise
-    return tuple(captured)
+    return tuple([capture.part(item, "[{}]", place) for place, item in enumerate(items)])
 
 
 class DictHandler:
@@ -114,14 +112,10 @@ class DictHandler:
     name = "dict"
 
     def capture(self, capture: Capture, obj: dict[Any, Any]) -> Any:
-        captured = []
-        for key, value in obj.items():
-            try:
-                captured.append((capture(key), capture(value)))
-            except SnapshotUnsupportedError as error:
-                error.path.insert(0, f"[{key!r}]")
-                raise
-        return tuple(captured)
+        path = "[{!r}]"
+        return tuple(
+            [(capture.part(key, path, key), capture.part(value, path, key)) for key, value in obj.items()]
+        )
 
     def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
         made: dict[Any, Any] = {}
@@ -136,10 +130,4 @@ class DictHandler:
         if stays:
             restore.do_then(refill_dict, current, made)
             return current
-        return made
-
-    def copy(self, copier: Copier, obj: dict[Any, Any]) -> Any:
-        made = copier.enter(obj, {})
-        for key, value in obj.items():
-            made[copier.copy(key)] = copier.copy(value)
         return made

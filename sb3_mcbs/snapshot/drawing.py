@@ -1,11 +1,10 @@
 """Packages that draw: windows and what belongs to them are no state, values are."""
 
-from collections.abc import Callable
 from typing import Any
 
 from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
-from sb3_mcbs.snapshot.object_graph import Capture, Copier, Restore, class_name
-from sb3_mcbs.snapshot.pygame_values import is_display, value_class
+from sb3_mcbs.snapshot.object_graph import Capture, Restore, class_name
+from sb3_mcbs.snapshot.pygame_values import value_class
 
 #: Windows, render contexts and what lies in their memory: whatever is there stays, a copy has none.
 _WINDOWS = (
@@ -76,18 +75,3 @@ class DrawnHandler:
 
     def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
         raise AssertionError("nothing of this kind is captured")
-
-    def copy(self, copier: Copier, obj: Any) -> Any:
-        return self.capture(Capture(lambda _: None, {}, 0), obj)
-
-
-def stays(obj: Any, handler_of: Callable[[Any], Any]) -> bool:
-    """Return whether an object is no state: it stays where it is, whatever was there before.
-
-    :param obj: any object.
-    :param handler_of: the kind of an object; None if it never changes.
-    """
-    kind = handler_of(obj)
-    if kind is None:
-        return False
-    return kind.name in ("constant", "window") or (kind.name == "surface" and is_display(obj))

@@ -7,7 +7,7 @@ import types
 from typing import Any
 
 from sb3_mcbs.snapshot.errors import SnapshotMismatchError, SnapshotUnsupportedError
-from sb3_mcbs.snapshot.object_graph import ATOMIC_CLASSES, MISSING, Capture, Copier, Restore
+from sb3_mcbs.snapshot.object_graph import ATOMIC_CLASSES, MISSING, Capture, Ref, Restore
 from sb3_mcbs.snapshot.stand_ins import bound, function_of
 
 _EMPTY = ("empty",)
@@ -93,13 +93,9 @@ class FunctionHandler:
     def capture(self, capture: Capture, obj: types.FunctionType) -> Any:
         if not is_own(obj):
             return FunctionName(obj), capture.attempt(*(obj.__closure__ or ())) or (), None
-        cells = []
-        for name, cell in zip(obj.__code__.co_freevars, obj.__closure__ or (), strict=True):
-            try:
-                cells.append(capture(cell))
-            except SnapshotUnsupportedError as error:
-                error.path.insert(0, f" (variable {name} of {obj.__qualname__})")
-                raise
+        variables = zip(obj.__code__.co_freevars, obj.__closure__ or (), strict=True)
+        path = " (variable {} of {})"
+        cells = [capture.part(cell, path, name, obj.__qualname__) for name, cell in variables]
         return FunctionName(obj), tuple(cells), _capture_extras(capture, obj)
 
     def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
@@ -114,22 +110,12 @@ class FunctionHandler:
         function = name.find()
         if not cells and extras in (None, _NO_EXTRAS):
             return function
-        # The function that was found closes over another instance's variables, which are not to be touched.
-        missing = [ref for ref in cells if ref.index not in restore.memo]
-        restore.memo.update((ref.index, types.CellType()) for ref in missing)
-        made = restore.memo[index] = _with_cells(function, tuple(restore.memo[ref.index] for ref in cells))
-        for ref in missing:
-            _restore_content(restore, restore.memo[ref.index], restore.nodes[ref.index][1])
-        _restore_extras(restore, extras, made, live=False)
-        return made
-
-    def copy(self, copier: Copier, obj: types.FunctionType) -> Any:
-        if is_own(obj):
-            return _copy(copier, obj, _extras(obj))
         try:
-            return _copy(copier, obj, _NO_EXTRAS)
+            return _make_another(restore, index, function, cells, extras)
         except SnapshotUnsupportedError:
-            return obj
+            if extras is not None:
+                raise
+            return function
 
 
 Extras = tuple[Any, Any, Any]
@@ -162,15 +148,12 @@ def _extras(function: types.FunctionType) -> Extras:
 
 def _capture_extras(capture: Capture, function: types.FunctionType) -> Extras:
     defaults, keywords, attributes = _extras(function)
-    try:
-        return (
-            capture(defaults),
-            capture(keywords),
-            tuple((name, capture(value)) for name, value in attributes),
-        )
-    except SnapshotUnsupportedError as error:
-        error.path.insert(0, f" (default or attribute of {function.__qualname__})")
-        raise
+    where = " (default or attribute of {})", function.__qualname__
+    return (
+        capture.part(defaults, *where),
+        capture.part(keywords, *where),
+        tuple((name, capture.part(value, *where)) for name, value in attributes),
+    )
 
 
 def _restore_extras(
@@ -193,24 +176,16 @@ def _restore_extras(
         restore.do_then(delattr, function, name)
 
 
-def _copy(copier: Copier, function: types.FunctionType, extras: Extras) -> types.FunctionType:
-    """Copy a function with what it closes over, before which it is known itself: it may call itself."""
-    cells = function.__closure__ or ()
-    if not cells and extras == _NO_EXTRAS:
-        return function
-    missing = [cell for cell in cells if id(cell) not in copier.memo]
-    for cell in missing:
-        copier.enter(cell, types.CellType())
-    made = copier.enter(function, _with_cells(function, tuple(copier.memo[id(cell)] for cell in cells)))
-    for cell in missing:
-        _copy_content(copier, cell, copier.memo[id(cell)])
-    defaults, keywords, attributes = extras
-    if defaults is not None:
-        made.__defaults__ = copier.copy(defaults)
-    if keywords is not None:
-        made.__kwdefaults__ = copier.copy(keywords)
-    for name, value in attributes:
-        setattr(made, name, copier.copy(value))
+def _make_another(
+    restore: Restore, index: int, function: types.FunctionType, cells: tuple[Ref, ...], extras: Extras | None
+) -> types.FunctionType:
+    """Make a function with cells of its own: those of the one at hand belong to another instance."""
+    missing = [ref for ref in cells if ref.index not in restore.memo]
+    restore.memo.update((ref.index, types.CellType()) for ref in missing)
+    made = restore.memo[index] = _with_cells(function, tuple(restore.memo[ref.index] for ref in cells))
+    for ref in missing:
+        _fill(restore, restore.memo[ref.index], restore.nodes[ref.index][1])
+    _restore_extras(restore, extras, made, live=False)
     return made
 
 
@@ -241,29 +216,23 @@ class CellHandler:
         return ("full", capture(content))
 
     def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
-        cell = restore.memo[index] = types.CellType() if current is MISSING else current
-        _restore_content(restore, cell, payload)
-        return cell
-
-    def copy(self, copier: Copier, obj: types.CellType) -> Any:
-        made = copier.enter(obj, types.CellType())
-        _copy_content(copier, obj, made)
-        return made
-
-
-def _restore_content(restore: Restore, cell: types.CellType, payload: Any) -> None:
-    if payload == _EMPTY:
-        return
-    have = _content(cell)
-    value = restore(payload[1], have)
-    if value is not have and value is not MISSING:
-        restore.do_then(setattr, cell, "cell_contents", value)
+        if current is MISSING:
+            made = restore.memo[index] = types.CellType()
+            _fill(restore, made, payload)
+            return made
+        restore.memo[index] = current
+        have = _content(current)
+        value = MISSING if payload == _EMPTY else restore(payload[1], have)
+        if value is not have and value is not MISSING:
+            restore.do_then(setattr, current, "cell_contents", value)
+        return current
 
 
-def _copy_content(copier: Copier, cell: types.CellType, made: types.CellType) -> None:
-    content = _content(cell)
-    if content is not MISSING:
-        made.cell_contents = copier.copy(content)
+def _fill(restore: Restore, cell: types.CellType, payload: Any) -> None:
+    """Give a cell that was just made its content."""
+    value = MISSING if payload == _EMPTY else restore(payload[1])
+    if value is not MISSING:
+        cell.cell_contents = value
 
 
 def _content(cell: Any) -> Any:
@@ -287,9 +256,6 @@ class MethodHandler:
         made = bound(function, restore(payload[1], current.__self__ if is_method else MISSING))
         return current if made == current else made
 
-    def copy(self, copier: Copier, obj: types.MethodType) -> Any:
-        return bound(copier.copy(function_of(obj)), copier.copy(obj.__self__))
-
 
 class BuiltinMethodHandler:
     """Compiled functions, and methods of compiled classes such as ``Generator.normal``."""
@@ -307,9 +273,3 @@ class BuiltinMethodHandler:
         if owner is None:
             return name
         return getattr(restore(owner, getattr(current, "__self__", MISSING)), name)
-
-    def copy(self, copier: Copier, obj: types.BuiltinMethodType) -> Any:
-        owner = obj.__self__
-        if owner is None or isinstance(owner, types.ModuleType):
-            return obj
-        return getattr(copier.copy(owner), obj.__name__)

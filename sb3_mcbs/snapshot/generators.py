@@ -1,22 +1,31 @@
-"""Random generators and the sequences that they spawn from: reading, setting and seeding their states."""
+"""Random generators and the sequences that they spawn from. The global ones belong to no environment."""
 
 import functools
 import random
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
+
+from sb3_mcbs.snapshot.object_graph import MISSING, Capture, Node, Ref, Restore
 
 _U64 = 2**64
 _CLASSES = (np.random.Generator, np.random.RandomState, np.random.BitGenerator, random.Random)
 
 #: What a seed sequence consists of: entropy, spawn key, pool size, and how many children it has spawned.
-Seeds = tuple[Any, tuple[int, ...], int, int]
+_Seeds = tuple[Any, tuple[int, ...], int, int]
 
-_NO_SEEDS: Seeds = (0, (), 4, 0)
+_NO_SEEDS: _Seeds = (0, (), 4, 0)
 # Far from where any environment's own counter is, and below the end of its 32 bits.
 _FIRST_OTHER_CHILD = 2**30
+
+_GLOBALS: dict[str, Callable[[], Any]] = {
+    "numpy": lambda: np.random.mtrand._rand,
+    "python": lambda: random._inst,
+    "torch": lambda: getattr(sys.modules.get("torch"), "default_generator", None),
+}
 
 
 def is_generator(obj: Any) -> bool:
@@ -30,86 +39,171 @@ def is_generator(obj: Any) -> bool:
     return torch is not None and isinstance(obj, torch.Generator)
 
 
-def global_name(generator: Any) -> str | None:
-    """Name a generator that belongs to the process, as that of ``np.random.normal``; None for others.
+class GeneratorHandler:
+    """Random generators, with the sequences that they spawn from. Those of the process are no state."""
 
-    :param generator: the generator.
+    name = "generator"
+
+    def capture(self, capture: Capture, obj: Any) -> Any:
+        global_name = next((name for name, find in _GLOBALS.items() if find() is obj), None)
+        if global_name is not None:
+            return global_name, None, None
+        bits = _bits_of(obj)
+        shared = capture.owner_of(bits, obj)
+        if shared is not None:
+            return _classes_of(obj), shared, None
+        return _classes_of(obj), _get_state(bits), _capture_seeds(capture, bits, obj)
+
+    def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
+        classes, state, seeds = payload
+        if isinstance(classes, str):
+            return _GLOBALS[classes]()
+        if not is_generator(current) or _classes_of(current) != classes:
+            current = MISSING
+        if type(state) is Ref:
+            return _over(_bits_of(restore(state)), classes, current)
+        reused = _claim(restore, current, seeds)
+        generator = current if reused else _make_like(*classes)
+        sequence = None if seeds is None else _sequence_of(generator)
+        if type(seeds) is Ref:
+            shared = _sequence_of(restore(seeds))
+            if shared is not None and shared is not sequence:
+                restore.do_then(_use_sequence, generator, shared)
+            seeds = None
+        if isinstance(restore.rng, np.random.Generator):
+            restore.do_then(_reseed, generator, restore.rng, seeds)
+            return generator
+        if restore.rng == "keep":
+            if not reused:
+                return generator
+            # An adapter may draw from it on the way, so that keeping it means to put it back.
+            state = _get_state(generator)
+            seeds = None if seeds is None or sequence is None else _read_seeds(sequence)
+        restore.do_then(_set_state, generator, state)
+        if seeds is not None and sequence is not None:
+            restore.do_then(_set_seeds, sequence, seeds)
+        return generator
+
+
+class SeedsHandler:
+    """Sequences that random generators are spawned from."""
+
+    name = "seeds"
+
+    def capture(self, capture: Capture, obj: np.random.SeedSequence) -> Any:
+        return _capture_seeds(capture, obj, obj)
+
+    def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
+        if type(payload) is Ref:
+            return _sequence_of(restore(payload))
+        reused = type(current) is np.random.SeedSequence and restore.claim(current)
+        sequence = current if reused else _make_sequence(payload)
+        if isinstance(restore.rng, np.random.Generator):
+            rng = restore.rng
+            restore.do_then(lambda: _reseed_sequence(sequence, payload, int(rng.integers(2**63))))
+        elif restore.rng == "restore":
+            restore.do_then(_set_seeds, sequence, payload)
+        elif reused:
+            restore.do_then(_set_seeds, sequence, _read_seeds(sequence))
+        return sequence
+
+
+def states_in(nodes: Iterable[Node]) -> list[Any]:
+    """Return the states of the random generators that were captured.
+
+    :param nodes: of a snapshot.
     """
-    return next((name for name, find in _GLOBALS.items() if find() is generator), None)
+    return [payload[1:] for kind, payload in nodes if kind == GeneratorHandler.name]
 
 
-def global_generator(name: str) -> Any:
-    """Return a generator that belongs to the process.
+def restore_np_random(restore: Restore, value: Any, attributes: dict[str, Any]) -> None:
+    """Plan what becomes of the ``_np_random`` of an environment or a space.
 
-    :param name: what :func:`global_name` returned.
+    :param restore: carries the choice between restoring, keeping and seeding afresh.
+    :param value: the captured value: None if no generator was there.
+    :param attributes: the attributes of the environment or space.
     """
-    return _GLOBALS[name]()
+    current = attributes.get("_np_random")
+    if value is not None:
+        generator = restore(value, current if current is not None else MISSING)
+        if restore.rng == "keep" and current is None:
+            generator = None
+    elif isinstance(restore.rng, np.random.Generator):
+        # Gymnasium would make it from the system's entropy when it is first drawn from.
+        usable = is_generator(current) and restore.claim(current)
+        generator = current if usable else np.random.Generator(np.random.PCG64(0))
+        restore.do_then(_reseed, generator, restore.rng)
+    else:
+        generator = current if restore.rng == "keep" else None
+    if generator is not current:
+        restore.do_then(attributes.__setitem__, "_np_random", generator)
 
 
-_GLOBALS: dict[str, Callable[[], Any]] = {
-    "numpy": lambda: np.random.mtrand._rand,
-    "python": lambda: random._inst,
-    "torch": lambda: getattr(sys.modules.get("torch"), "default_generator", None),
-}
+def _capture_seeds(capture: Capture, bits: Any, owner: Any) -> Any:
+    """Capture the sequence of a generator, or name the node that it is captured with."""
+    sequence = _sequence_of(bits)
+    if sequence is None:
+        return None
+    shared = capture.owner_of(sequence, owner)
+    return _read_seeds(sequence) if shared is None else shared
 
 
-def bits_of(generator: Any) -> Any:
-    """Return what the state of a generator lives in: NumPy's bit generator, or the generator itself.
+def _claim(restore: Restore, generator: Any, seeds: Any) -> bool:
+    """Return whether a generator is there that can be used, with all that it consists of."""
+    if generator is MISSING:
+        return False
+    bits = _bits_of(generator)
+    if not restore.claim(bits):
+        return False
+    if type(seeds) is not tuple:
+        return True
+    sequence = _sequence_of(bits)
+    return sequence is not None and restore.claim(sequence)
 
-    :param generator: the generator.
-    """
+
+def _over(bits: Any, classes: tuple[type, type], current: Any) -> Any:
+    """Return a generator that draws from the bit generator of another one."""
+    if classes[0] is classes[1]:
+        return bits
+    if current is not MISSING and _bits_of(current) is bits:
+        return current
+    return classes[0](bits)
+
+
+def _bits_of(generator: Any) -> Any:
+    """Return what the state of a generator lives in: NumPy's bit generator, or the generator itself."""
     if isinstance(generator, np.random.Generator):
         return generator.bit_generator
     return generator
 
 
-@functools.lru_cache(maxsize=64)
-def pair_name(classes: tuple[type, type]) -> str:
-    """Name the kind; states can be exchanged between generators of one kind.
-
-    :param classes: what :func:`classes_of` returned for a generator.
-    """
-    generator_class, bits_class = classes
-    outer = "" if bits_class is generator_class else f"{generator_class.__name__}:"
-    return f"{outer}{bits_class.__module__}.{bits_class.__qualname__}"
+def _classes_of(generator: Any) -> tuple[type, type]:
+    """States can be exchanged between generators of the same classes."""
+    return type(generator), type(_bits_of(generator))
 
 
-def is_of_kind(obj: Any, kind: str) -> bool:
-    """Return whether an object is a generator of a kind.
-
-    :param obj: any object.
-    :param kind: what :func:`pair_name` returned.
-    """
-    return is_generator(obj) and pair_name(classes_of(obj)) == kind
+def _make_like(generator_class: type, bits_class: type) -> Any:
+    """Make a generator of some classes, whose state is about to be set."""
+    bits = bits_class()
+    return bits if generator_class is bits_class else generator_class(bits)
 
 
-def sequence_of(generator: Any) -> np.random.SeedSequence | None:
-    """Return the sequence that a generator spawns from, if it has one whose state can be captured.
-
-    :param generator: the generator, or a sequence itself.
-    """
-    sequence = getattr(bits_of(generator), "seed_seq", generator)
+def _sequence_of(generator: Any) -> np.random.SeedSequence | None:
+    """Return the sequence that a generator spawns from, if its state can be captured."""
+    sequence = getattr(_bits_of(generator), "seed_seq", generator)
     return sequence if type(sequence) is np.random.SeedSequence else None
 
 
-def read_seeds(sequence: np.random.SeedSequence) -> Seeds:
-    """Read the state of a sequence.
-
-    :param sequence: the sequence.
-    """
+def _read_seeds(sequence: np.random.SeedSequence) -> _Seeds:
     entropy: Any = sequence.entropy
     if isinstance(entropy, np.ndarray):
         entropy = entropy.tolist()
     return entropy, sequence.spawn_key, sequence.pool_size, sequence.n_children_spawned
 
 
-def set_seeds(sequence: np.random.SeedSequence, seeds: Seeds) -> None:
-    """Put a sequence into a state, in place: whoever else holds it goes on with it.
-
-    :param sequence: the sequence.
-    :param seeds: what :func:`read_seeds` returned.
-    """
-    have = read_seeds(sequence)
+def _set_seeds(sequence: np.random.SeedSequence, seeds: _Seeds) -> None:
+    """Put a sequence into a state, in place: whoever else holds it goes on with it."""
+    have = _read_seeds(sequence)
     if have == seeds:
         return
     # NumPy lets nobody write the counter, but pickles of a sequence have it.
@@ -117,7 +211,7 @@ def set_seeds(sequence: np.random.SeedSequence, seeds: Seeds) -> None:
         pickled = [*_pickled(sequence)]
         pickled[_counter_place()] = seeds[3]
     else:
-        pickled = [*_pickled(make_sequence(seeds))]
+        pickled = [*_pickled(_make_sequence(seeds))]
     sequence.__setstate__(tuple(pickled))  # type: ignore[attr-defined]
 
 
@@ -132,44 +226,28 @@ def _counter_place() -> int:
     return [type(part) is int and part == _FIRST_OTHER_CHILD for part in pickled].index(True)
 
 
-def make_sequence(seeds: Seeds) -> np.random.SeedSequence:
-    """Make a sequence in a state.
-
-    :param seeds: what :func:`read_seeds` returned.
-    """
+def _make_sequence(seeds: _Seeds) -> np.random.SeedSequence:
     entropy, spawn_key, pool_size, n_spawned = seeds
     return np.random.SeedSequence(
         entropy, spawn_key=spawn_key, pool_size=pool_size, n_children_spawned=n_spawned
     )
 
 
-def use_sequence(generator: Any, sequence: np.random.SeedSequence) -> None:
-    """Have a generator spawn from a sequence.
-
-    :param generator: the generator.
-    :param sequence: the sequence.
-    """
-    bits = bits_of(generator)
+def _use_sequence(generator: Any, sequence: np.random.SeedSequence) -> None:
+    """Have a generator spawn from a sequence."""
+    bits = _bits_of(generator)
     bits.__setstate__((bits.state, sequence))
 
 
-def reseed_sequence(sequence: np.random.SeedSequence, seeds: Seeds, number: int) -> None:
-    """Have a sequence spawn others than it would have spawned.
-
-    :param sequence: the sequence.
-    :param seeds: the state that the result depends on.
-    :param number: a random number that it depends on, too.
-    """
+def _reseed_sequence(sequence: np.random.SeedSequence, seeds: _Seeds, number: int) -> None:
+    """Have a sequence spawn others than it would have spawned from a state, depending on a random number."""
     # Another counter gives other children as surely as other entropy does, which would have to be hashed.
-    set_seeds(sequence, (*seeds[:3], _FIRST_OTHER_CHILD + number % _FIRST_OTHER_CHILD))
+    _set_seeds(sequence, (*seeds[:3], _FIRST_OTHER_CHILD + number % _FIRST_OTHER_CHILD))
 
 
-def get_state(generator: Any) -> Any:
-    """Read the state of a generator, as an object of its own.
-
-    :param generator: the generator.
-    """
-    bits = bits_of(generator)
+def _get_state(generator: Any) -> Any:
+    """Read the state of a generator, as an object of its own."""
+    bits = _bits_of(generator)
     if isinstance(bits, np.random.BitGenerator):
         return bits.state
     if isinstance(bits, np.random.RandomState):
@@ -179,13 +257,9 @@ def get_state(generator: Any) -> Any:
     return bits.get_state().numpy().tobytes()
 
 
-def set_state(generator: Any, state: Any) -> None:
-    """Put a generator into a state.
-
-    :param generator: the generator.
-    :param state: what :func:`get_state` returned for a generator of the same kind.
-    """
-    bits = bits_of(generator)
+def _set_state(generator: Any, state: Any) -> None:
+    """Put a generator into a state of one of the same classes."""
+    bits = _bits_of(generator)
     if isinstance(bits, np.random.BitGenerator):
         bits.state = state
     elif isinstance(bits, np.random.RandomState):
@@ -197,17 +271,12 @@ def set_state(generator: Any, state: Any) -> None:
         bits.set_state(torch.frombuffer(bytearray(state), dtype=torch.uint8))
 
 
-def reseed(generator: Any, rng: np.random.Generator, seeds: Seeds | None = _NO_SEEDS) -> None:
-    """Start a generator afresh at a state drawn from another generator.
-
-    :param generator: the generator to seed, of any kind.
-    :param rng: where the seed is drawn from.
-    :param seeds: for :func:`reseed_sequence` and its own sequence; None to leave that alone.
-    """
-    number = _reseed_bits(bits_of(generator), rng)
-    sequence = None if seeds is None else sequence_of(generator)
+def _reseed(generator: Any, rng: np.random.Generator, seeds: _Seeds | None = _NO_SEEDS) -> None:
+    """Start a generator, and its sequence unless ``seeds`` is None, at a state drawn from another one."""
+    number = _reseed_bits(_bits_of(generator), rng)
+    sequence = None if seeds is None else _sequence_of(generator)
     if sequence is not None and seeds is not None:
-        reseed_sequence(sequence, seeds, number)
+        _reseed_sequence(sequence, seeds, number)
 
 
 def _reseed_bits(bits: Any, rng: np.random.Generator) -> int:
@@ -243,20 +312,46 @@ def _four_numbers(rng: np.random.Generator) -> list[int]:
     return rng.integers(0, _U64, size=4, dtype=np.uint64).tolist()
 
 
-def make_like(generator_class: type, bits_class: type, sequence: np.random.SeedSequence | None = None) -> Any:
-    """Make a generator whose state is about to be set.
+def global_states() -> tuple[Any, ...]:
+    """Read the states of the process's generators: Python's, NumPy's, torch's."""
+    torch: Any = sys.modules.get("torch")
+    torch_state = None if torch is None else torch.get_rng_state()
+    return random.getstate(), np.random.get_state(), torch_state
 
-    :param generator_class: the class of the generator.
-    :param bits_class: the class of its bit generator; the same class if it has none.
-    :param sequence: what it shall spawn from, if anything.
+
+def seed_globals(seed: int) -> None:
+    """Seed all global generators.
+
+    :param seed: in [0, 2**32).
     """
-    bits = bits_class() if sequence is None else bits_class(sequence)
-    return bits if generator_class is bits_class else generator_class(bits)
+    random.seed(seed)
+    np.random.seed(seed)
+    torch: Any = sys.modules.get("torch")
+    if torch is not None:
+        torch.default_generator.manual_seed(seed)
 
 
-def classes_of(generator: Any) -> tuple[type, type]:
-    """Return what :func:`make_like` needs to make another generator of this kind.
+@contextmanager
+def globals_kept() -> Iterator[None]:
+    """Put all global generators back to where they were."""
+    python_state, numpy_state, torch_state = global_states()
+    try:
+        yield
+    finally:
+        random.setstate(python_state)
+        np.random.set_state(numpy_state)
+        if torch_state is not None:
+            sys.modules["torch"].set_rng_state(torch_state)
 
-    :param generator: the generator.
+
+@contextmanager
+def isolated_globals(seed: int) -> Iterator[None]:
+    """Give all global generators other states inside, and their own ones back after.
+
+    An environment that draws from them neither changes nor foresees what the training draws.
+
+    :param seed: for the states inside, in [0, 2**32).
     """
-    return type(generator), type(bits_of(generator))
+    with globals_kept():
+        seed_globals(seed)
+        yield

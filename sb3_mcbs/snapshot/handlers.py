@@ -13,18 +13,17 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec, WrapperSpec
 
-from sb3_mcbs.snapshot import generators
-from sb3_mcbs.snapshot.arrays import ArrayHandler, BytearrayHandler, counterpart
+from sb3_mcbs.snapshot.arrays import ArrayHandler, BytearrayHandler
 from sb3_mcbs.snapshot.classes import ClassHandler, LocalClassHandler, is_local, is_made_per_instance
-from sb3_mcbs.snapshot.containers import DictHandler, SequenceHandler
+from sb3_mcbs.snapshot.containers import DictHandler, SequenceHandler, TupleHandler
 from sb3_mcbs.snapshot.drawing import DrawnHandler, kind_name
 from sb3_mcbs.snapshot.errors import SnapshotMismatchError
 from sb3_mcbs.snapshot.functions import BuiltinMethodHandler, CellHandler, FunctionHandler, MethodHandler
+from sb3_mcbs.snapshot.generators import GeneratorHandler, SeedsHandler, is_generator
 from sb3_mcbs.snapshot.object_graph import (
     ATOMIC_CLASSES,
     MISSING,
     Capture,
-    Copier,
     Restore,
     TypeHandler,
     class_name,
@@ -33,14 +32,13 @@ from sb3_mcbs.snapshot.objects import (
     ObjectHandler,
     ReducedHandler,
     capture_content,
-    copy_content,
     is_global,
     is_ordinary,
     restore_content,
 )
-from sb3_mcbs.snapshot.pygame_values import PygameHandler, SurfaceHandler
-from sb3_mcbs.snapshot.randomness import GeneratorHandler, SeedsHandler, SpaceHandler
+from sb3_mcbs.snapshot.pygame_values import PygameHandler, SurfaceHandler, is_display
 from sb3_mcbs.snapshot.registry import SnapshotAdapter, call_on_change, find_adapter
+from sb3_mcbs.snapshot.spaces import SpaceHandler
 from sb3_mcbs.snapshot.tensors import TensorHandler, is_tensor
 from sb3_mcbs.snapshot.weak import PROXIES, ProxyHandler, WeakrefHandler
 
@@ -59,9 +57,9 @@ _ATOMIC_BASES = (np.generic, np.dtype, enum.Enum, pathlib.PurePath)
 _EXACT: dict[type, str] = {
     np.ndarray: "array",
     list: "sequence",
-    tuple: "sequence",
+    tuple: "tuple",
     set: "sequence",
-    frozenset: "sequence",
+    frozenset: "tuple",
     deque: "sequence",
     dict: "dict",
     types.FunctionType: "function",
@@ -76,7 +74,7 @@ _CONSTANT_BASES = (types.ModuleType, EnvSpec, WrapperSpec, logging.Logger, loggi
 
 
 class ConstantHandler:
-    """Objects that are not state: whatever is there stays, and a copy refers to the same."""
+    """Objects that are not state: whatever is there stays."""
 
     name = "constant"
 
@@ -86,17 +84,11 @@ class ConstantHandler:
     def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
         return current
 
-    def copy(self, copier: Copier, obj: Any) -> Any:
-        return obj
-
 
 class WindowHandler(ConstantHandler):
-    """Windows and render contexts: whatever is there stays, and a copy has none."""
+    """Windows and render contexts: whatever is there stays."""
 
     name = "window"
-
-    def copy(self, copier: Copier, obj: Any) -> Any:
-        return None
 
 
 class PartHandler(ConstantHandler):
@@ -109,9 +101,6 @@ class PartHandler(ConstantHandler):
 
     def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
         return current if restore.is_original(index, current) else restore.places.view_at(payload, current)
-
-    def copy(self, copier: Copier, obj: Any) -> Any:
-        return counterpart(copier, obj)
 
 
 class AdapterHandler:
@@ -142,15 +131,6 @@ class AdapterHandler:
             restore_content(restore, content, current, adapter.not_state)
         return current
 
-    def copy(self, copier: Copier, obj: Any) -> Any:
-        adapter = find_adapter(obj)
-        assert adapter is not None
-        made = copier.enter(obj, adapter.clone(obj, copier.copy))
-        copier.adapted.append((adapter, obj, made))
-        if adapter.with_attributes:
-            copy_content(copier, obj, made, adapter.not_state)
-        return made
-
 
 def plan_adapter(restore: Restore, adapter: SnapshotAdapter | None, obj: Any, state: Any) -> None:
     """Check a state that an adapter captured and plan to put it back.
@@ -176,8 +156,8 @@ def plan_adapter(restore: Restore, adapter: SnapshotAdapter | None, obj: Any, st
 HANDLERS: dict[str, TypeHandler] = {}
 for _handler_class in (
     ConstantHandler, WindowHandler, DrawnHandler, PygameHandler, SurfaceHandler, PartHandler,
-    ArrayHandler, BytearrayHandler, TensorHandler, SequenceHandler, DictHandler, GeneratorHandler,
-    SeedsHandler, SpaceHandler, ObjectHandler, ReducedHandler, ProxyHandler, WeakrefHandler,
+    ArrayHandler, BytearrayHandler, TensorHandler, TupleHandler, SequenceHandler, DictHandler,
+    GeneratorHandler, SeedsHandler, SpaceHandler, ObjectHandler, ReducedHandler, ProxyHandler, WeakrefHandler,
     AdapterHandler, ClassHandler, LocalClassHandler, FunctionHandler, CellHandler, MethodHandler,
     BuiltinMethodHandler,
 ):  # fmt: skip
@@ -223,6 +203,17 @@ def handler_of(obj: Any) -> TypeHandler | None:
     return handler
 
 
+def stays(obj: Any) -> bool:
+    """Return whether an object is no state: it stays where it is, whatever was there before.
+
+    :param obj: any object.
+    """
+    handler = handler_of(obj)
+    if handler is None:
+        return False
+    return handler.name in ("constant", "window") or (handler.name == "surface" and is_display(obj))
+
+
 def _decide_class(cls: type) -> TypeHandler | None:
     if is_made_per_instance(cls, handler_of):
         return HANDLERS["class"]
@@ -250,7 +241,7 @@ def _decide(obj: Any, cls: type) -> TypeHandler | None:
         return HANDLERS[drawing]
     if is_tensor(obj):
         return HANDLERS["torch"]
-    if generators.is_generator(obj):
+    if is_generator(obj):
         return HANDLERS["generator"]
     if issubclass(cls, spaces.Space):
         return HANDLERS["space"]

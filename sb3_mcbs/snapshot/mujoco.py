@@ -7,7 +7,6 @@ model, which environments may edit.
 
 import ctypes
 import operator
-import weakref
 from collections import OrderedDict
 from collections.abc import Callable
 from typing import Any
@@ -16,6 +15,7 @@ import mujoco
 import numpy as np
 
 from sb3_mcbs.snapshot.errors import SnapshotMismatchError
+from sb3_mcbs.snapshot.identity import ByIdentity
 from sb3_mcbs.snapshot.mujoco_views import address, counterpart, place_of, public, view_at
 from sb3_mcbs.snapshot.registry import SnapshotAdapter
 
@@ -134,18 +134,12 @@ class ModelState:
             vector.reshape(-1)[:] = np.frombuffer(content, vector.dtype)
 
 
-_layouts: dict[int, tuple[Any, _ModelLayout]] = {}
+_layouts: ByIdentity[_ModelLayout] = ByIdentity()
 
 
 def _layout(model: Any) -> _ModelLayout:
     """Return the layout of a model, found once in its life."""
-    known = _layouts.get(id(model))
-    if known is not None and known[0]() is model:
-        return known[1]
-    key = id(model)
-    layout = _ModelLayout(model)
-    _layouts[key] = (weakref.ref(model, lambda _: _layouts.pop(key, None)), layout)
-    return layout
+    return _layouts.get(model) or _layouts.put(model, _ModelLayout(model))
 
 
 def _check_same_model(sizes: dict[str, int], names: bytes, layout: _ModelLayout) -> None:

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from sb3_mcbs.snapshot.identity import ByIdentity
+
 # What a model or its data hand out as objects of their own, and those of them that hold arrays.
 _PARTS = ("opt", "stat", "vis", "contact", "warning", "timer", "solver")
 _WITH_ARRAYS = ("opt", "stat", "warning", "timer", "solver")
@@ -17,7 +19,7 @@ _PART = "part"
 _OWNER = "PyCapsule"
 
 #: Finding the place of an array means to compare it with hundreds of others.
-_known: dict[int, tuple[Any, Any, tuple[Any, ...]]] = {}
+_known: ByIdentity[tuple[Any, tuple[Any, ...]]] = ByIdentity()
 _fields: dict[type, tuple[list[str], list[str]]] = {}
 
 
@@ -47,13 +49,12 @@ def place_of(obj: Any, view: Any) -> tuple[Any, ...] | None:
     """
     if not isinstance(view, np.ndarray):
         return _place_of_part(obj, view)
-    known = _known.get(id(view))
-    if known is not None and known[0]() is view:
-        return known[2] if known[1]() is obj else None
+    known = _known.get(view)
+    if known is not None:
+        return known[1] if known[0]() is obj else None
     place = _find(obj, view, _arrays(obj)[0]) if _is_of_mujoco(view) else None
     if place is not None:
-        key = id(view)
-        _known[key] = weakref.ref(view, lambda _: _known.pop(key, None)), weakref.ref(obj), place
+        _known.put(view, (weakref.ref(obj), place))
     return place
 
 

@@ -1,14 +1,15 @@
-"""Ordinary state as a graph: captured into plain values, put back, copied.
+"""Ordinary state as a graph: captured into plain values, and put back.
 
 An environment's attributes form a graph: wrappers refer to each other, arrays are shared, functions
-close over objects. The three classes here walk it, each with a memo, so that what was shared stays
-shared. What is done with one object is decided by its handler (:mod:`sb3_mcbs.snapshot.handlers`).
+close over objects. Two classes walk it, each with a memo, so that what was shared stays shared. The
+handler of an object (:mod:`sb3_mcbs.snapshot.handlers`) says what is done with it. A clone is captured
+and restored where nothing is (:mod:`sb3_mcbs.snapshot.cloning`).
 """
 
 import copy as copy_module
 import re
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -52,7 +53,7 @@ class Ref:
 
 
 class TypeHandler(Protocol):
-    """Captures, restores and copies the objects of some types."""
+    """Captures and restores the objects of some types."""
 
     name: str
 
@@ -61,9 +62,6 @@ class TypeHandler(Protocol):
 
     def restore(self, restore: "Restore", index: int, payload: Any, current: Any) -> Any:
         """Return the object for a captured content; ``current`` is what is at its place now."""
-
-    def copy(self, copier: "Copier", obj: Any) -> Any:
-        """Return an independent copy and enter it in the copier's memo."""
 
 
 Node = tuple[str, Any]
@@ -125,6 +123,20 @@ class Capture:
             ) from error
         return ref
 
+    def part(self, value: Any, path: str, *names: Any) -> Any:
+        """Return a captured value that is part of an object.
+
+        :param value: the part.
+        :param path: where in the object it is, for an error: a format string.
+        :param names: the fields of ``path``.
+        :raises SnapshotUnsupportedError: names the part.
+        """
+        try:
+            return self(value)
+        except SnapshotUnsupportedError as error:
+            error.path.insert(0, path.format(*names))
+            raise
+
     def owner_of(self, part: Any, obj: Any) -> Ref | None:
         """Return the node that a part was captured with; None if an object is the first to have it.
 
@@ -157,7 +169,7 @@ class Capture:
 
 
 class Restore:
-    """Turns captured values back into objects, without changing anything until :meth:`commit`.
+    """Turns captured values back into objects, without changing any that is there until :meth:`commit`.
 
     :param nodes: the nodes that the captured values refer to.
     :param handlers: by name.
@@ -170,7 +182,7 @@ class Restore:
 
     def __init__(
         self,
-        nodes: tuple[Node, ...],
+        nodes: Sequence[Node],
         handlers: dict[str, TypeHandler],
         known: list[Any],
         rng: RngMode,
@@ -213,7 +225,7 @@ class Restore:
         except SnapshotError:
             raise
         except Exception as error:
-            raise _cannot_be_made(name if current is MISSING else class_name(type(current)), error) from error
+            raise cannot_be_made(name if current is MISSING else class_name(type(current)), error) from error
         return restored
 
     def is_original(self, index: int, current: Any) -> bool:
@@ -250,58 +262,17 @@ class Restore:
 
     def commit(self) -> None:
         """Make the planned calls."""
-        for function, *arguments in self._first:
+        for function, *arguments in (*self._first, *self._then):
             function(*arguments)
-        for function, *arguments in self._then:
-            function(*arguments)
+        self._first, self._then = [], []
 
 
-class Copier:
-    """Copies values, keeping what is shared among them shared among the copies.
+def cannot_be_made(what: str, error: Exception) -> SnapshotUnsupportedError:
+    """Say that an object cannot be made from its captured content.
 
-    :param handler_of: the handler of an object; None for objects that never change.
-    :param known: id of an object -> what stands in its place in the copy.
+    :param what: its class.
+    :param error: what making it raised.
     """
-
-    def __init__(self, handler_of: Callable[[Any], TypeHandler | None], known: dict[int, Any]) -> None:
-        self.memo = known
-        self.adapted: list[tuple[Any, Any, Any]] = []
-        self.handler_of = handler_of
-        self.alive: list[Any] = []
-
-    def copy(self, value: Any) -> Any:
-        """Return the copy of a value.
-
-        :param value: any value that an environment holds.
-        :raises SnapshotUnsupportedError: if part of it cannot be copied.
-        """
-        if type(value) in ATOMIC_CLASSES or (handler := self.handler_of(value)) is None:
-            return value
-        key = id(value)
-        if key not in self.memo:
-            self.alive.append(value)
-            try:
-                # The handler enters it in the memo as well if the object can refer to itself.
-                self.memo[key] = handler.copy(self, value)
-            except SnapshotError:
-                raise
-            except Exception as error:
-                raise _cannot_be_made(class_name(type(value)), error) from error
-        return self.memo[key]
-
-    def enter(self, value: Any, copy: Any) -> Any:
-        """Note the copy of an object before its content is copied.
-
-        :param value: the object.
-        :param copy: its copy, still empty.
-        :return: ``copy``.
-        """
-        self.alive.append(value)
-        self.memo[id(value)] = copy
-        return copy
-
-
-def _cannot_be_made(what: str, error: Exception) -> SnapshotUnsupportedError:
     return SnapshotUnsupportedError(
         f"making another {what} of the same content raised {type(error).__name__}: {error}"
     )

@@ -11,9 +11,17 @@ from collections import Counter, OrderedDict, defaultdict
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
-from sb3_mcbs.snapshot.containers import capture_items, refill_dict
-from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
-from sb3_mcbs.snapshot.object_graph import MISSING, Capture, Copier, Ref, Restore, class_name
+from sb3_mcbs.snapshot.containers import TupleHandler, capture_items, refill_dict
+from sb3_mcbs.snapshot.errors import SnapshotError, SnapshotUnsupportedError
+from sb3_mcbs.snapshot.object_graph import (
+    ATOMIC_CLASSES,
+    MISSING,
+    Capture,
+    Ref,
+    Restore,
+    cannot_be_made,
+    class_name,
+)
 
 
 class ObjectHandler:
@@ -35,11 +43,6 @@ class ObjectHandler:
         restore_content(restore, attributes, current)
         return current
 
-    def copy(self, copier: Copier, obj: Any) -> Any:
-        made = copier.enter(obj, blank(copier.copy(type(obj))))
-        copy_content(copier, obj, made)
-        return made
-
 
 Attributes = tuple[tuple[str, Any], ...]
 
@@ -52,16 +55,13 @@ def capture_content(capture: Capture, obj: Any, leave_out: frozenset[str] = froz
     :param leave_out: names of attributes that are not state.
     :return: names and captured values.
     """
-    attributes = []
-    for name, value in attributes_of(obj).items():
-        if name in leave_out:
-            continue
-        try:
-            attributes.append((name, capture(value)))
-        except SnapshotUnsupportedError as error:
-            error.path.insert(0, f".{name}")
-            raise
-    return tuple(attributes)
+    return tuple(
+        [
+            (name, value if type(value) in ATOMIC_CLASSES else capture.part(value, ".{}", name))
+            for name, value in attributes_of(obj).items()
+            if name not in leave_out
+        ]
+    )
 
 
 def restore_content(
@@ -90,24 +90,6 @@ def _set_changed(obj: Any, values: dict[str, Any], gone: Iterable[str]) -> None:
     set_attributes(
         obj, {name: value for name, value in values.items() if have.get(name, MISSING) is not value}, gone
     )
-
-
-def copy_content(copier: Copier, obj: Any, made: Any, leave_out: frozenset[str] = frozenset()) -> None:
-    """Give a new object copies of the attributes of another one.
-
-    :param copier: what copies them.
-    :param obj: the object.
-    :param made: the new object.
-    :param leave_out: names of attributes that ``made`` has already, if it needs them.
-    """
-    attributes, put = attributes_of(obj), _setter(made)
-    copies = {name: value for name, value in attributes_of(made).items() if name in leave_out}
-    names = [name for name in attributes if name not in leave_out]
-    for name in sorted(names, key=lambda name: not _is_hashed(copier, attributes[name])):
-        copies[name] = copier.copy(attributes[name])
-        put(name, copies[name])
-    in_order = dict.fromkeys((*attributes, *copies))
-    _set_in_order(made, {name: copies[name] for name in in_order if name in copies})
 
 
 def blank(cls: type) -> Any:
@@ -149,14 +131,9 @@ def _made_anew(restore: Restore, index: int, cls: type, attributes: Any, have: d
     return made
 
 
-def _is_hashed(walker: Restore | Copier, value: Any) -> bool:
+def _is_hashed(restore: Restore, value: Any) -> bool:
     """Return whether an attribute holds what hashes are computed from: a constant, or a tuple of some."""
-    if isinstance(walker, Copier):
-        return type(value) in (tuple, frozenset) or walker.handler_of(value) is None
-    if type(value) is not Ref:
-        return True
-    kind, payload = walker.nodes[value.index]
-    return kind == "sequence" and payload[0] in (tuple, frozenset)
+    return type(value) is not Ref or restore.nodes[value.index][0] == TupleHandler.name
 
 
 def _setter(obj: Any) -> Callable[[str, Any], None]:
@@ -236,7 +213,12 @@ class ReducedHandler:
         in_place = restore.in_place
         # Others may read at once what they are made of, before that is as it was.
         restore.in_place = in_place and isinstance(current, _ONLY_REFER)
-        made = self._make(restore, index, payload, current)
+        try:
+            made = self._make(restore, index, payload, current)
+        except SnapshotError:
+            raise
+        except Exception as error:
+            raise cannot_be_made(payload[-1], error) from error
         restore.in_place = in_place
         if restore.is_original(index, current) and type(current) in _DICTIONARIES:
             restore.do_then(refill_dict, current, made)
@@ -259,12 +241,6 @@ class ReducedHandler:
             restored_key = restore(key)
             filled.append((restored_key, restore(value, pairs_there.get(restored_key, MISSING))))
         return _fill(made, restore(state, have.state), content, filled)
-
-    def copy(self, copier: Copier, obj: Any) -> Any:
-        function, arguments, state, items, pairs = _reduce(obj)
-        made = copier.enter(obj, function(*copier.copy(arguments)))
-        content = [copier.copy(item) for item in items]
-        return _fill(made, copier.copy(state), content, [(copier.copy(k), copier.copy(v)) for k, v in pairs])
 
 
 class Reduced(NamedTuple):

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_mcbs.snapshot.object_graph import MISSING, Capture, Copier, Restore, class_name
-from sb3_mcbs.snapshot.objects import capture_content, copy_content, restore_content
+from sb3_mcbs.snapshot.object_graph import MISSING, Capture, Restore, class_name
+from sb3_mcbs.snapshot.objects import capture_content, restore_content
 
 _SURFACE = "pygame.surface.Surface"
 
@@ -95,14 +95,6 @@ class PygameHandler:
         restore_content(restore, attributes, made)
         return made
 
-    def copy(self, copier: Copier, obj: Any) -> Any:
-        its = _class_of(type(obj))
-        content = its.read(obj)
-        made = copier.enter(obj, _make(copier.copy(type(obj)), *its.arguments(content)))
-        its.write(made, content)
-        copy_content(copier, obj, made)
-        return made
-
 
 def _class_of(cls: type) -> _Class:
     known = value_class(cls)
@@ -139,15 +131,6 @@ class SurfaceHandler:
         if not same:
             restore.do_then(_draw, made, form, pixels)
         restore_content(restore, attributes, made)
-        return made
-
-    def copy(self, copier: Copier, obj: Any) -> Any:
-        if is_display(obj):
-            return None
-        parent, form = copier.copy(obj.get_parent()), _format(obj)
-        made = copier.enter(obj, _blank_surface(copier.copy(type(obj)), form, parent))
-        _draw(made, form, _pixels(obj) if parent is None else None)
-        copy_content(copier, obj, made)
         return made
 
 

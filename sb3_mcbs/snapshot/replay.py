@@ -10,15 +10,14 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 from gymnasium.envs.registration import load_env_creator
 
-from sb3_mcbs.snapshot.attributes import capture_attributes, restore_attributes
 from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
 from sb3_mcbs.snapshot.handlers import HANDLERS, handler_of
-from sb3_mcbs.snapshot.layers import NOT_STATE, RECORDER
+from sb3_mcbs.snapshot.layers import NOT_STATE, RECORDER, capture_attributes, restore_attributes
 from sb3_mcbs.snapshot.object_graph import Capture, Node, Ref, Restore, private_copy
 from sb3_mcbs.snapshot.registry import SnapshotAdapter
 
 
-class Episode(NamedTuple):
+class RecordedEpisode(NamedTuple):
     """What has to be replayed.
 
     :param attributes: attributes of the environment just before its reset, generators included.
@@ -48,7 +47,7 @@ class Recorder:
         self.env = env
         self._prepare = prepare
         self._not_state = NOT_STATE | not_state
-        self.episode: Episode | None = None
+        self.episode: RecordedEpisode | None = None
         self.actions: list[Any] = []
         #: Whether steps were taken that no record of an episode began with.
         self.unrecorded = False
@@ -106,11 +105,11 @@ class Recorder:
         """
         capture = Capture(handler_of, {id(self.env): Ref(0)}, 1)
         attributes = capture_attributes(capture, self.env, self._not_state, skip_unsupported=True)
-        self.episode = Episode(attributes, tuple(capture.nodes), private_copy(arguments), ())
+        self.episode = RecordedEpisode(attributes, tuple(capture.nodes), private_copy(arguments), ())
         self.actions = []
         self.unrecorded = self.must_reset = False
 
-    def replay(self, episode: Episode) -> None:
+    def replay(self, episode: RecordedEpisode) -> None:
         """Repeat an episode on the environment.
 
         :param episode: what to repeat.
@@ -154,12 +153,12 @@ class ReplayAdapter(SnapshotAdapter):
         self.not_state = ReplayAdapter.not_state | type(self).not_state
 
     def attach(self, env: Any) -> None:
-        if _recorder(env) is None:
+        if find_recorder(env) is None:
             constructor_arguments(env)
             Recorder(env, self._prepare, self.not_state)
 
-    def capture(self, obj: Any) -> Episode | None:
-        recorder = _recorder(obj)
+    def capture(self, obj: Any) -> RecordedEpisode | None:
+        recorder = find_recorder(obj)
         if recorder is None:
             raise SnapshotUnsupportedError(
                 f"a {type(obj).__name__} is restored by replay, which is possible only where it is the "
@@ -171,8 +170,8 @@ class ReplayAdapter(SnapshotAdapter):
             return None
         return recorder.episode._replace(actions=tuple(recorder.actions))
 
-    def restore(self, obj: Any, state: Episode | None) -> None:
-        recorder = _recorder(obj)
+    def restore(self, obj: Any, state: RecordedEpisode | None) -> None:
+        recorder = find_recorder(obj)
         assert recorder is not None, "attach() comes before restore()"
         if state is None:
             recorder.episode, recorder.actions = None, []
@@ -208,7 +207,11 @@ def _unrecorded(env: Any) -> str:
     )
 
 
-def _recorder(env: Any) -> Recorder | None:
+def find_recorder(env: Any) -> Any:
+    """Return what records the episodes of an environment, None if nothing does.
+
+    :param env: the environment.
+    """
     return vars(env).get(RECORDER)
 
 

@@ -1,38 +1,33 @@
 """Spaces: what one contains, as plain values that can be compared and made a space again."""
 
 import operator
-import weakref
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
-from sb3_mcbs.snapshot.object_graph import ATOMIC_CLASSES
+from sb3_mcbs.snapshot.generators import restore_np_random
+from sb3_mcbs.snapshot.identity import ByIdentity
+from sb3_mcbs.snapshot.object_graph import ATOMIC_CLASSES, Capture, Restore
 
 #: A space's class, and its attributes without its generator. Spaces in it are definitions themselves.
-Definition = tuple[type, tuple[tuple[str, Any], ...]]
+_Definition = tuple[type, tuple[tuple[str, Any], ...]]
 
 _GENERATOR = "_np_random"
 #: Bounds of this many bytes at most are compared each time, in case somebody edits them in place.
 _SMALL = 1024
 
 
-def parts_of(space: spaces.Space) -> list[spaces.Space]:
-    """Return a space and the spaces in it.
-
-    :param space: the space.
-    """
-    if isinstance(space, spaces.Box | spaces.Discrete | spaces.MultiBinary):
-        return [space]
-    parts = [space]
-    for inner in _inner(space):
-        parts.extend(parts_of(inner))
-    return parts
+def _parts_of(space: spaces.Space) -> list[spaces.Space]:
+    """Return a space and the spaces in it."""
+    return [space, *(part for inner in _inner(space) for part in _parts_of(inner))]
 
 
 def _inner(space: spaces.Space) -> list[spaces.Space]:
     """Return the spaces right within a space."""
+    if isinstance(space, spaces.Box | spaces.Discrete | spaces.MultiBinary):
+        return []
     found = []
     for value in vars(space).values():
         items = value.values() if isinstance(value, dict) else value
@@ -45,15 +40,12 @@ def _inner(space: spaces.Space) -> list[spaces.Space]:
 class _Known:
     """A space whose definition was made, and what shows that it has not changed since."""
 
-    def __init__(self, space: spaces.Space, definition: Definition) -> None:
-        key = id(space)
-        self.ref = weakref.ref(space, lambda _: _cached.pop(key, None))
+    def __init__(self, space: spaces.Space, definition: _Definition) -> None:
         self.definition = definition
         self._values = _without_generator(space)
         self._bounds = [value for value in self._values if _is_small(value)]
         self._contents = [bounds.tobytes() for bounds in self._bounds]
-        is_leaf = isinstance(space, spaces.Box | spaces.Discrete | spaces.MultiBinary)
-        self._inner = None if is_leaf else [(inner, definition_of(inner)) for inner in _inner(space)]
+        self._inner = [(inner, _definition_of(inner)) for inner in _inner(space)]
 
     def holds(self, space: spaces.Space) -> bool:
         """Return whether the definition is still that of the space."""
@@ -62,16 +54,14 @@ class _Known:
             return False
         if self._contents != [bounds.tobytes() for bounds in self._bounds]:
             return False
-        if self._inner is None:
-            return True
         inner = _inner(space)
         return len(inner) == len(self._inner) and all(
-            one is other and definition_of(one) is definition
+            one is other and _definition_of(one) is definition
             for one, (other, definition) in zip(inner, self._inner, strict=True)
         )
 
 
-_cached: dict[int, _Known] = {}
+_cached: ByIdentity[_Known] = ByIdentity()
 
 
 def _without_generator(space: spaces.Space) -> list[Any]:
@@ -82,25 +72,20 @@ def _is_small(value: Any) -> bool:
     return isinstance(value, np.ndarray) and value.nbytes <= _SMALL and value.dtype != bool
 
 
-def definition_of(space: spaces.Space) -> Definition:
-    """Say what a space contains.
-
-    :param space: the space.
-    :return: the same object as before, as long as nobody changed the space.
-    """
-    known = _cached.get(id(space))
-    if known is not None and known.ref() is space and known.holds(space):
+def _definition_of(space: spaces.Space) -> _Definition:
+    """Say what a space contains: the same object as before, as long as nobody changed the space."""
+    known = _cached.get(space)
+    if known is not None and known.holds(space):
         return known.definition
     attributes = tuple((name, _plain(value)) for name, value in vars(space).items() if name != _GENERATOR)
     definition = (type(space), attributes)
-    _cached[id(space)] = _Known(space, definition)
-    return definition
+    return _cached.put(space, _Known(space, definition)).definition
 
 
 def _plain(value: Any) -> Any:
     """Return a value that never changes, for one that a space holds."""
     if isinstance(value, spaces.Space):
-        return ("space", definition_of(value))
+        return ("space", _definition_of(value))
     if isinstance(value, np.ndarray):
         return ("array", value.copy())
     if isinstance(value, dict):
@@ -113,18 +98,16 @@ def _plain(value: Any) -> Any:
     return ("other", None)  # such as a function: whatever is there
 
 
-def is_defined_as(space: spaces.Space, definition: Definition) -> bool:
-    """Return whether a space contains what a definition says.
-
-    :param space: the space.
-    :param definition: what :func:`definition_of` returned.
-    """
-    own = definition_of(space)
+def _is_defined_as(space: spaces.Space, definition: _Definition) -> bool:
+    """Return whether a space contains what a definition says."""
+    own = _definition_of(space)
     if own is definition:
         return True
     if not _equal(own, definition):
         return False
-    _cached[id(space)].definition = definition  # the next comparison sees that they are the same
+    known = _cached.get(space)
+    assert known is not None
+    known.definition = definition  # the next comparison sees that they are the same
     return True
 
 
@@ -145,11 +128,8 @@ def _equal(left: Any, right: Any) -> bool:
 _CONTAINERS = {"list": list, "tuple": tuple, "set": set, "frozenset": frozenset}
 
 
-def made_of(definition: Definition) -> Any:
-    """Make a space, without a generator yet.
-
-    :param definition: what :func:`definition_of` returned.
-    """
+def _made_of(definition: _Definition) -> Any:
+    """Make a space, without a generator yet."""
     cls, attributes = definition
     space: Any = object.__new__(cls)
     vars(space).update({name: _made(value) for name, value in attributes})
@@ -162,7 +142,7 @@ def _made(value: Any) -> Any:
         return value
     form, content = value
     if form == "space":
-        return made_of(content)
+        return _made_of(content)
     if form == "array":
         return content.copy()
     if form == "dict":
@@ -170,6 +150,42 @@ def _made(value: Any) -> Any:
     if form == "other":
         return None
     return _CONTAINERS[form](_made(item) for item in content)
+
+
+class SpaceHandler:
+    """Spaces: what they contain is state, as environments may exchange them, and so are their generators.
+
+    A space that is still the same stays where it is: others hold it, too.
+    """
+
+    name = "space"
+
+    def capture(self, capture: Capture, obj: spaces.Space) -> Any:
+        parts = _parts_of(obj)
+        return _definition_of(obj), tuple(capture(part._np_random) for part in parts)
+
+    def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
+        definition, generators_of_parts = payload
+        if not isinstance(current, spaces.Space) or not _is_defined_as(current, definition):
+            current = _made_of(definition)
+        parts = _parts_of(current)
+        for part, value in zip(parts, generators_of_parts, strict=True):
+            restore_np_random(restore, value, vars(part))
+        return current
+
+
+def describe_space(space: Any) -> str:
+    """Describe the shape of a space: observations of equal descriptions are interchangeable.
+
+    :param space: the space.
+    """
+    if isinstance(space, spaces.Dict):
+        return "{" + ", ".join(f"{key}: {describe_space(inner)}" for key, inner in space.spaces.items()) + "}"
+    if isinstance(space, spaces.Tuple):
+        return "(" + ", ".join(describe_space(inner) for inner in space.spaces) + ")"
+    shape = getattr(space, "shape", None)
+    size = f"({space.n})" if isinstance(space, spaces.Discrete) else f"{shape} {getattr(space, 'dtype', '')}"
+    return f"{type(space).__name__}{size}"
 
 
 def values_of(observation: Any) -> Iterator[np.ndarray]:

@@ -3,7 +3,7 @@
 import dis
 import functools
 import types
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
@@ -38,16 +38,12 @@ def set_by(cls: type) -> frozenset[str]:
     :param cls: the class.
     """
     methods = [member for member in vars(cls).values() if isinstance(member, types.FunctionType)]
-    return frozenset(name for method in methods for name in _stored(method.__code__))
-
-
-def _stored(code: types.CodeType) -> Iterator[str]:
-    for instruction in dis.get_instructions(code):
-        if instruction.opname == "STORE_ATTR":
-            yield instruction.argval
-    for constant in code.co_consts:
-        if isinstance(constant, types.CodeType):
-            yield from _stored(constant)
+    return frozenset(
+        instruction.argval
+        for method in methods
+        for instruction in dis.get_instructions(method)
+        if instruction.opname == "STORE_ATTR"
+    )
 
 
 class StandIn(gym.Wrapper[Any, Any, Any, Any]):

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
-from sb3_mcbs.snapshot.object_graph import MISSING, Capture, Copier, Ref, Restore, class_name
-from sb3_mcbs.snapshot.objects import capture_content, copy_content, restore_content
+from sb3_mcbs.snapshot.object_graph import MISSING, Capture, Ref, Restore, class_name
+from sb3_mcbs.snapshot.objects import capture_content, restore_content
 
 
 def is_tensor(obj: Any) -> bool:
@@ -67,15 +67,6 @@ class TensorHandler:
         if restored is not made.grad:
             restore.do_then(setattr, made, "grad", restored)
         restore_content(restore, attributes, made)
-        return made
-
-    def copy(self, copier: Copier, obj: Any) -> Any:
-        storage = _storage_of(obj)
-        if id(storage) not in copier.memo:
-            copier.enter(storage, storage.clone())
-        made = copier.enter(obj, _tensor(copier.memo[id(storage)], _layout(obj)))
-        made.grad = copier.copy(obj.grad if obj.is_leaf else None)
-        copy_content(copier, obj, made)
         return made
 
 

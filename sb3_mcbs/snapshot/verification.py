@@ -9,20 +9,22 @@ import copy
 import logging
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable, Sequence
+from typing import Any
 from weakref import WeakKeyDictionary, ref
 
 import gymnasium as gym
 import numpy as np
 
 from sb3_mcbs.snapshot.errors import SnapshotError, SnapshotMismatchError, SnapshotUnsupportedError
-from sb3_mcbs.snapshot.global_generators import globals_kept, seed_globals
+from sb3_mcbs.snapshot.generators import globals_kept, seed_globals
 from sb3_mcbs.snapshot.layers import Layer, replaced_method
 from sb3_mcbs.snapshot.object_graph import private_copy
 from sb3_mcbs.snapshot.objects import attributes_of
+from sb3_mcbs.snapshot.outcomes import Outcome, first_difference
 from sb3_mcbs.snapshot.registry import SnapshotAdapter, find_adapter
 from sb3_mcbs.snapshot.spaces import random_action
+from sb3_mcbs.snapshot.stack import Stack, State
 
 logger = logging.getLogger("sb3_mcbs")
 
@@ -84,45 +86,83 @@ class InexactError(SnapshotUnsupportedError):
         self.what = what
 
 
-class Checked(Protocol):
-    """What is checked: an environment that can be captured."""
+class CheckedEnvironment:
+    """An environment as the check uses it.
 
-    def capture(self) -> Any:
+    :param stack: its layers.
+    :param env: the outermost one that is stepped.
+    :param reset_arguments: of every reset; without a seed, it is 0.
+    :param clone: makes a clone of layers: its layers, and the wrapper around them.
+    :param wrapper: the wrapper around it, if it is a clone.
+    """
+
+    def __init__(
+        self,
+        stack: Stack,
+        env: Any,
+        reset_arguments: dict[str, Any],
+        clone: Callable[[Stack], tuple[Stack, Any]],
+        wrapper: Any = None,
+    ) -> None:
+        self.stack = stack
+        self._env = env
+        self._reset_arguments = reset_arguments
+        self._clone = clone
+        self._wrapper = wrapper
+
+    def capture(self) -> State:
         """Return its state."""
+        return self._named("capturing its state", lambda: self.stack.capture(monitor=False))
 
-    def put_back(self, state: Any) -> None:
-        """Put it into a captured state."""
+    def put_back(self, state: State) -> None:
+        """Put it into a captured state.
 
-    def copy(self) -> "Checked":
+        :param state: of :meth:`capture`.
+        """
+        self._named("putting its state back", lambda: self.stack.restore(state.layers, state.nodes))
+
+    def copy(self) -> "CheckedEnvironment":
         """Return an independent copy in the present state."""
+        stack, wrapper = self._named("making a clone of it", lambda: self._clone(self.stack))
+        return CheckedEnvironment(stack, wrapper.env, self._reset_arguments, self._clone, wrapper)
 
     def reset(self) -> None:
         """Reset it, always with the same seed.
 
         :raises CannotResetError: if that raised anything.
         """
+        arguments = private_copy(self._reset_arguments)
+        try:
+            self._env.reset(seed=arguments["seed"] or 0, options=arguments["options"])
+        except Exception as error:
+            raise CannotResetError(
+                f"The snapshots of {type(self._env.unwrapped).__name__} could not be checked: its reset "
+                f"raised {type(error).__name__}: {error}. SnapshotEnvWrapper(env, verify=False) leaves out "
+                "the check."
+            ) from error
 
     def step(self, action: Any) -> Any:
-        """Step it."""
+        """Step it.
+
+        :param action: as in Gymnasium.
+        """
+        return self._env.step(action)
 
     def close(self) -> None:
         """Close it, if it is a copy."""
+        if self._wrapper is not None:
+            self._wrapper.close()
 
-
-class Outcome(NamedTuple):
-    """What one step gave; ``raised`` names the class of what it raised instead, ``error`` all of it."""
-
-    observation: Any = None
-    reward: Any = None
-    terminated: Any = None
-    truncated: Any = None
-    raised: str | None = None
-    error: str = ""
-
-    @property
-    def ends(self) -> bool:
-        """Whether no step can follow."""
-        return bool(self.raised or self.terminated or self.truncated)
+    def _named(self, what: str, call: Callable[[], Any]) -> Any:
+        try:
+            return call()
+        except SnapshotError:
+            raise
+        except Exception as error:
+            name = type(self._env.unwrapped).__name__
+            raise SnapshotUnsupportedError(
+                f"{name} cannot be captured: {what} raised {type(error).__name__}: {error}"
+            ) from error
 
 
 def is_known_exact(layers: Sequence[Layer], own_adapters: tuple[type, ...]) -> bool:
@@ -167,17 +207,17 @@ def _text(value: Any) -> Any:
         return object()
 
 
-def check_exact(checked: Checked, layers: Sequence[Layer], action_space: gym.Space) -> None:
+def check_exact(checked: CheckedEnvironment, action_space: gym.Space) -> None:
     """Compare what an environment does after a restore, and in a clone, with what it did before.
 
     The environment is left somewhere; global generators are left as they were.
 
     :param checked: the environment.
-    :param layers: its layers.
     :param action_space: of the environment.
     :raises SnapshotUnsupportedError: names what differed, and at which step.
     """
     start = time.perf_counter()
+    layers = checked.stack.layers
     name = type(layers[-1].env).__name__
     as_it_came = _fingerprint(layers)
     with globals_kept():
@@ -188,7 +228,7 @@ def check_exact(checked: Checked, layers: Sequence[Layer], action_space: gym.Spa
     logger.info("snapshots of %s were checked: exact in %d steps (%.2f s)", name, n_steps, seconds)
 
 
-def _check_each_way(checked: Checked, env: Any, action_space: gym.Space) -> int:
+def _check_each_way(checked: CheckedEnvironment, env: Any, action_space: gym.Space) -> int:
     """Check an environment, and again if its adapter knows another way to capture it.
 
     :return: how many steps the comparisons took.
@@ -211,7 +251,7 @@ def _check_each_way(checked: Checked, env: Any, action_space: gym.Space) -> int:
 
 class _Check:
     def __init__(
-        self, checked: Checked, env: Any, action_space: gym.Space, adapter: SnapshotAdapter | None
+        self, checked: CheckedEnvironment, env: Any, action_space: gym.Space, adapter: SnapshotAdapter | None
     ) -> None:
         self._env = checked
         self._name = type(env).__name__
@@ -263,7 +303,7 @@ class _Check:
         )
 
     def _check_copy(
-        self, copy_of_env: Checked, actions: list[Any], state: Any, expected: list[Outcome]
+        self, copy_of_env: CheckedEnvironment, actions: list[Any], state: Any, expected: list[Outcome]
     ) -> None:
         """Step a copy and the original in turns: each must do what it does alone."""
         half = min(STEPS // 2, len(expected))
@@ -277,7 +317,7 @@ class _Check:
         copy_of_env.put_back(state)
         self._compare(expected, self._steps(copy_of_env, actions), "In a clone after a restore")
 
-    def _check_later(self, copy_of_env: Checked) -> bool:
+    def _check_later(self, copy_of_env: CheckedEnvironment) -> bool:
         """The same from a state that is farther from the reset. Return whether the episode ended."""
         actions, state = self._draw(STEPS), self._env.capture()
         expected = self._steps(self._env, actions)
@@ -294,7 +334,7 @@ class _Check:
         self._env.reset()
         return self._steps(self._env, self._draw(n_steps))
 
-    def _steps(self, env: Checked, actions: list[Any], first: int = 0) -> list[Outcome]:
+    def _steps(self, env: CheckedEnvironment, actions: list[Any], first: int = 0) -> list[Outcome]:
         outcomes: list[Outcome] = []
         for number, action in enumerate(actions, first):
             self._n_steps += 1
@@ -319,7 +359,7 @@ class _Check:
             seed_globals(0)
             self._env.reset()
             runs.append(self._steps(self._env, actions))
-        return _first_difference(*runs) is None
+        return first_difference(*runs) is None
 
     def _compare(
         self,
@@ -329,7 +369,7 @@ class _Check:
         repeats: Callable[[list[Any]], bool] | None = None,
         first: int = 0,
     ) -> None:
-        difference = _first_difference(expected, seen)
+        difference = first_difference(expected, seen)
         if difference is None:
             return
         step, what = difference
@@ -349,47 +389,3 @@ def _sampler(space: gym.Space) -> Callable[[], Any]:
     own = copy.deepcopy(space)
     own.seed(0)
     return own.sample
-
-
-def _first_difference(expected: list[Outcome], seen: list[Outcome]) -> tuple[int, str] | None:
-    """Find the first step in which two runs differ.
-
-    :return: its number, and what differed in words; None if nothing did.
-    """
-    for step, (one, other) in enumerate(zip(expected, seen, strict=False)):
-        if one.raised != other.raised:
-            return step, f"raised {other.error}" if other.raised else f"did not raise {one.error}"
-        for name in ("observation", "reward", "terminated", "truncated"):
-            for path, value, its in _leaves(getattr(one, name), getattr(other, name), name):
-                if not _is_same(value, its):
-                    return step, f"gave {_in_words(path, value, its)}"
-    return None
-
-
-def _leaves(one: Any, other: Any, path: str) -> Iterator[tuple[str, Any, Any]]:
-    """Go through two values of the same structure; where it differs they are leaves themselves."""
-    if isinstance(one, dict) and isinstance(other, dict) and one.keys() == other.keys():
-        for key in one:
-            yield from _leaves(one[key], other[key], f"{path}[{key!r}]")
-    elif isinstance(one, tuple | list) and isinstance(other, tuple | list) and len(one) == len(other):
-        for place in range(len(one)):
-            yield from _leaves(one[place], other[place], f"{path}[{place}]")
-    else:
-        yield path, one, other
-
-
-def _is_same(one: Any, other: Any) -> bool:
-    one, other = np.asarray(one), np.asarray(other)
-    if one.dtype != other.dtype or one.shape != other.shape:
-        return False
-    return bool(np.array_equal(one, other)) if one.dtype.hasobject else one.tobytes() == other.tobytes()
-
-
-def _in_words(path: str, one: Any, other: Any) -> str:
-    one, other = np.asarray(one), np.asarray(other)
-    if one.shape == other.shape and one.ndim and one.dtype == other.dtype and not one.dtype.hasobject:
-        places = np.argwhere([not _is_same(a, b) for a, b in zip(one.ravel(), other.ravel(), strict=True)])
-        index = np.unravel_index(int(places[0, 0]), one.shape)
-        path += f"[{', '.join(map(str, index))}]"
-        one, other = one[index], other[index]
-    return f"{path} = {other} instead of {one}"

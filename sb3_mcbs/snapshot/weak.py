@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
-from sb3_mcbs.snapshot.object_graph import MISSING, Capture, Copier, Ref, Restore, class_name
+from sb3_mcbs.snapshot.object_graph import MISSING, Capture, Ref, Restore, class_name
 
 PROXIES = (weakref.ProxyType, weakref.CallableProxyType)
 
@@ -21,14 +21,10 @@ class ProxyHandler:
 
     def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
         if payload is None:  # it stood for nothing any more
-            return current
+            return weakref.proxy(_Gone()) if current is MISSING else current
         have = _referent(current) if type(current) in PROXIES else MISSING
         referent = restore(payload, have)
         return current if referent is have or referent is MISSING else weakref.proxy(referent)
-
-    def copy(self, copier: Copier, obj: Any) -> Any:
-        referent = _referent(obj)
-        return obj if referent is MISSING else weakref.proxy(copier.copy(referent))
 
 
 def _referent(proxy: Any) -> Any:
@@ -61,10 +57,6 @@ class WeakrefHandler:
             return current if have is None else weakref.ref(_Gone())
         referent = restore(payload, MISSING if have is None else have)
         return current if referent is have or referent is MISSING else weakref.ref(referent)
-
-    def copy(self, copier: Copier, obj: Any) -> Any:
-        referent = _held_by(obj)
-        return obj if referent is None else weakref.ref(copier.copy(referent))
 
 
 def _held_by(reference: Any) -> Any:

@@ -9,15 +9,21 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from sb3_mcbs.snapshot.errors import SnapshotError, SnapshotMismatchError, SnapshotUnsupportedError
-from sb3_mcbs.snapshot.faults import diverged_step
-from sb3_mcbs.snapshot.layers import describe_space
+from sb3_mcbs.snapshot.divergence import diverged_step
+from sb3_mcbs.snapshot.errors import SnapshotError, SnapshotMismatchError
+from sb3_mcbs.snapshot.layers import CapturedLayer
 from sb3_mcbs.snapshot.object_graph import Node, RngMode, private_copy
-from sb3_mcbs.snapshot.pairing import CapturedLayer
 from sb3_mcbs.snapshot.pygame_values import display_kept
 from sb3_mcbs.snapshot.replay import Box2DAdapter
-from sb3_mcbs.snapshot.state import Stack
-from sb3_mcbs.snapshot.verification import CannotResetError, check_exact, has_passed, is_known_exact
+from sb3_mcbs.snapshot.spaces import describe_space
+from sb3_mcbs.snapshot.stack import Stack
+from sb3_mcbs.snapshot.verification import (
+    CannotResetError,
+    CheckedEnvironment,
+    check_exact,
+    has_passed,
+    is_known_exact,
+)
 
 # Names of an attribute, and of what only pickles have.
 _STACK, _KEPT = "_known_stack", "_kept_state"
@@ -119,8 +125,7 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
     def __getstate__(self) -> dict[str, Any]:
         state = {name: value for name, value in vars(self).items() if name != _STACK}
         if self.last_observation is not None:
-            kept = self._stack.keep(monitor=True)
-            state[_KEPT] = kept._replace(objects=[])
+            state[_KEPT] = self._stack.capture()._replace(objects=[])
         return state
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -134,7 +139,7 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
         attributes = {name: value for name, value in vars(self).items() if name != _STACK}
         vars(made).update(deepcopy(attributes, memo), **{_STACK: None})
         if self.last_observation is not None:
-            made._stack.become(self._stack.keep(monitor=True), shares=True)
+            made._stack.become(self._stack.capture(), shares=True)
         return made
 
     @property
@@ -192,8 +197,8 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
     def _check(self) -> None:
         stack = self._stack
         with stack.bare():
-            checked = _CheckedEnvironment(stack, self.env, self.reset_arguments)
-            check_exact(checked, stack.layers, self.action_space)
+            checked = CheckedEnvironment(stack, self.env, self.reset_arguments, _clone)
+            check_exact(checked, self.action_space)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Step the environment.
@@ -224,8 +229,8 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
             cannot be captured.
         """
         self.verify()
-        layers, nodes = self._stack.capture(monitor)
-        return Snapshot(layers, nodes, self._spaces, private_copy(self.last_observation))
+        state = self._stack.capture(monitor)
+        return Snapshot(state.layers, state.nodes, self._spaces, private_copy(self.last_observation))
 
     def restore(self, snapshot: Snapshot, rng: RngMode = "restore") -> None:
         """Put the environment back into a captured state.
@@ -269,7 +274,7 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
         :return: the copy, wrapped.
         """
         self.verify()
-        copy = _clone(self._stack)
+        _, copy = _clone(self._stack)
         copy._spaces, copy.verifies = self._spaces, self.verifies
         copy.reset_arguments = self.reset_arguments
         copy.last_observation = private_copy(self.last_observation)
@@ -291,67 +296,10 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
         return function(self, *args)
 
 
-def _clone(stack: Stack) -> SnapshotEnvWrapper:
+def _clone(stack: Stack) -> tuple[Stack, SnapshotEnvWrapper]:
     copy = SnapshotEnvWrapper(stack.clone(), verify=False)
     copy._is_copy = True
     if stack.incomplete_clones:
-        layers, nodes = stack.capture(monitor=False)
-        copy._stack.restore(layers, nodes, "restore")
-    return copy
-
-
-class _CheckedEnvironment:
-    """An environment as the check needs it.
-
-    :param stack: its layers.
-    :param env: the outermost one that is stepped.
-    :param reset_arguments: of every reset; without a seed, it is 0.
-    :param copy: the wrapper around it, if it is a copy.
-    """
-
-    def __init__(
-        self, stack: Stack, env: Any, reset_arguments: dict[str, Any], copy: SnapshotEnvWrapper | None = None
-    ) -> None:
-        self._stack = stack
-        self._env = env
-        self._reset_arguments = reset_arguments
-        self._copy = copy
-
-    def capture(self) -> Any:
-        return self._named("capturing its state", lambda: self._stack.capture(monitor=False))
-
-    def put_back(self, state: Any) -> None:
-        self._named("putting its state back", lambda: self._stack.restore(state[0], state[1], "restore"))
-
-    def copy(self) -> "_CheckedEnvironment":
-        copy = self._named("making a clone of it", lambda: _clone(self._stack))
-        return _CheckedEnvironment(copy._stack, copy.env, self._reset_arguments, copy)
-
-    def reset(self) -> None:
-        arguments = private_copy(self._reset_arguments)
-        try:
-            self._env.reset(seed=arguments["seed"] or 0, options=arguments["options"])
-        except Exception as error:
-            raise CannotResetError(
-                f"The snapshots of {type(self._env.unwrapped).__name__} could not be checked: its reset "
-                f"raised {type(error).__name__}: {error}. SnapshotEnvWrapper(env, verify=False) leaves out "
-                "the check."
-            ) from error
-
-    def step(self, action: Any) -> Any:
-        return self._env.step(action)
-
-    def close(self) -> None:
-        if self._copy is not None:
-            self._copy.close()
-
-    def _named(self, what: str, call: Callable[[], Any]) -> Any:
-        try:
-            return call()
-        except SnapshotError:
-            raise
-        except Exception as error:
-            name = type(self._env.unwrapped).__name__
-            raise SnapshotUnsupportedError(
-                f"{name} cannot be captured: {what} raised {type(error).__name__}: {error}"
-            ) from error
+        state = stack.capture(monitor=False)
+        copy._stack.restore(state.layers, state.nodes)
+    return copy._stack, copy
