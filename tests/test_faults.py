@@ -22,7 +22,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNorm
 from stable_baselines3.her import HerReplayBuffer
 
 from sb3_mcbs import MCBSTD3, NonFiniteError, SearchPolicy, SnapshotEnvWrapper, WorkerError
-from sb3_mcbs.agents.faults import InvalidDecisions, break_trajectories
+from sb3_mcbs.agents.checked_rollouts import break_trajectories
+from sb3_mcbs.agents.faults import InvalidDecisions
 from tests.conftest import snapshot_vec_env
 
 

@@ -35,7 +35,7 @@ def simulate(return_of, settings: ScheduleSettings, n_steps: int, n_envs: int = 
         total, bonus = return_of(step)
         share = searched[-EPISODE:].mean(axis=0) if len(searched) else 0.0
         rewards = np.where(ends, total + bonus * share + noise * rng.normal(size=n_envs), 0.0)
-        schedule.note_step(rewards, ends, step)
+        schedule.record_rewards(rewards, ends, step)
         if schedule.saturation.is_reduced != before:
             changes.append((step, schedule.saturation.is_reduced))
     return schedule, changes
@@ -131,7 +131,7 @@ def test_shares_of_steps_and_of_episodes(share):
         drawn = []
         for step in range(4000):
             drawn.append(schedule.draw(0.0, step))
-            schedule.note_step(np.zeros(5), np.full(5, step % 10 == 9), step)
+            schedule.record_rewards(np.zeros(5), np.full(5, step % 10 == 9), step)
         searched = np.array(drawn).reshape(400, 10, 5)
         assert abs(searched.mean() - share) < 0.03
         if unit == "episode":

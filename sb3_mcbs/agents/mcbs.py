@@ -6,7 +6,6 @@ from copy import copy
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
-from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.preprocessing import get_action_dim
@@ -14,15 +13,9 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Rollout
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_mcbs.agents.attributes import SearchAttributes
+from sb3_mcbs.agents.checked_rollouts import CheckedRollouts
 from sb3_mcbs.agents.exploration import DrawnNoise, noise_without_search
-from sb3_mcbs.agents.faults import (
-    VecCheckFinite,
-    check_observations,
-    diverged_environments,
-    environment_named,
-    leave_out_step,
-    warn_of_divergence,
-)
+from sb3_mcbs.agents.faults import environment_named
 from sb3_mcbs.agents.hyperparameters import (
     complete_settings,
     drop_removed,
@@ -54,7 +47,7 @@ from sb3_mcbs.types import take_rows
 SelfMCBS = TypeVar("SelfMCBS", bound="MCBS")
 
 
-class MCBS(SearchAttributes, Searching, Resumable):
+class MCBS(SearchAttributes, Searching, Resumable, CheckedRollouts):
     """
     Monte Carlo Beam Search for an off-policy agent of SB3: the mixin that stands before it.
 
@@ -119,7 +112,6 @@ class MCBS(SearchAttributes, Searching, Resumable):
         self._states: np.ndarray | None = None
         self.rollout_rng: np.random.Generator | None = None
         self.learned_model: LearnedModel | None = None
-        self._checked_env: VecCheckFinite | None = None
         self._noise_without_search: ActionNoise | None = None
 
     def _checked_settings(self) -> tuple[SearchSettings, ScheduleSettings]:
@@ -322,29 +314,13 @@ class MCBS(SearchAttributes, Searching, Resumable):
         # A rollout of whole episodes, say, goes on beyond ``total_timesteps``.
         return min(max(1.0 - self._current_progress_remaining, 0.0), 1.0)
 
-    def _store_transition(
-        self,
-        replay_buffer: ReplayBuffer,
-        buffer_action: np.ndarray,
-        new_obs: np.ndarray | dict[str, np.ndarray],
-        reward: np.ndarray,
-        dones: np.ndarray,
-        infos: list[dict[str, Any]],
-    ) -> None:
-        raw_reward = self._note_step(reward, dones)
+    def _store_valid_transition(self, *transition: Any) -> None:
+        _, actions, new_obs, reward, _, infos = transition
         assert self.planner is not None
-        diverged = diverged_environments(infos)
-        if diverged and self.n_diverged_steps == 0:
-            warn_of_divergence(buffer_action, diverged, self.num_timesteps)
-        self.n_diverged_steps += len(diverged)
-        self.logger.record("rollout/diverged_steps", self.n_diverged_steps)
-        if diverged:
-            leave_out_step(self, replay_buffer, new_obs)
-            return
         if self.num_timesteps - self.n_envs >= self.learning_starts:  # random actions have no directions
-            self.planner.remember_actions(buffer_action)
-        self._verify(buffer_action, EnvironmentStep(new_obs, raw_reward, infos))
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+            self.planner.remember_actions(actions)
+        self._verify(actions, EnvironmentStep(new_obs, self._raw_rewards(reward), infos))
+        super()._store_valid_transition(*transition)
 
     def _verify(self, actions: np.ndarray, happened: EnvironmentStep) -> None:
         """Compare what the forward model says of a step with what happened, and follow the environments."""
@@ -360,42 +336,24 @@ class MCBS(SearchAttributes, Searching, Resumable):
             if error > 0:
                 planner.resync(error)
 
-    def _note_step(self, reward: np.ndarray, dones: np.ndarray) -> np.ndarray:
-        """Tell the schedule of a step, and return its rewards as the environments gave them."""
-        assert self._schedule is not None and self._checked_env is not None
-        self._checked_env.unstored = None
+    def _raw_rewards(self, reward: np.ndarray) -> np.ndarray:
+        """Rewards as the environments gave them."""
         normalizer = self._vec_normalize_env
-        raw_reward = reward if normalizer is None else normalizer.get_original_reward()
-        self._schedule.note_step(raw_reward, dones, self.num_timesteps)
-        return raw_reward
+        return reward if normalizer is None else normalizer.get_original_reward()
 
-    def collect_rollouts(self, env: VecEnv, *args: Any, **kwargs: Any) -> RolloutReturn:
-        if self._checked_env is None or self._checked_env.venv is not env:
-            self._checked_env = VecCheckFinite(env)
+    def _record_rewards(self, reward: np.ndarray, dones: np.ndarray) -> None:
+        assert self._schedule is not None
+        self._schedule.record_rewards(self._raw_rewards(reward), dones, self.num_timesteps)
+
+    def _begin_episodes(self) -> None:
+        assert self._schedule is not None
+        self._schedule.begin_episodes(self.n_envs, self.num_timesteps)
+
+    def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
         self._expand_buffer()
-        self._leave_out_unstored()  # of a training that goes on in another agent, if a callback copied it
-        try:
-            return super().collect_rollouts(self._checked_env, *args, **kwargs)
-        finally:
-            # SB3 does not store the step in which a callback stops the training, but training may go on.
-            self._leave_out_unstored()
+        return super().collect_rollouts(*args, **kwargs)
 
-    def _leave_out_unstored(self) -> None:
-        assert self._checked_env is not None
-        if self._checked_env.unstored is not None:
-            new_obs, reward, dones = self._checked_env.unstored
-            self._note_step(reward, dones)
-            assert self.replay_buffer is not None
-            leave_out_step(self, self.replay_buffer, new_obs)
-
-    def _setup_learn(
-        self,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        reset_num_timesteps: bool = True,
-        *args: Any,
-        **kwargs: Any,
-    ) -> tuple[int, BaseCallback]:
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         self._noise_without_search = None
         self._explore_where_not_searched()
         self._check_noise_after_search()
@@ -404,15 +362,9 @@ class MCBS(SearchAttributes, Searching, Resumable):
             self.learned_model.check_room(self.replay_buffer)
         if not self.value_expansion:
             drop_states(self.replay_buffer)
-        will_reset = reset_num_timesteps or self._last_obs is None
-        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args, **kwargs)
+        result = super()._setup_learn(*args, **kwargs)
         if self._total_timesteps:  # what is known of progress is that of the training before
             self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
-        check_observations(self._last_obs)
-        if will_reset:
-            self._checked_env = None
-            assert self._schedule is not None
-            self._schedule.begin_episodes(self.n_envs, self.num_timesteps)
         return result
 
     def _check_noise_after_search(self) -> None:

@@ -226,7 +226,7 @@ class SearchSchedule:
         self._flags = np.where(self._flags < 0, drawn, self._flags)
         return self._flags == 1
 
-    def note_step(self, rewards: np.ndarray, dones: np.ndarray, step: int) -> None:
+    def record_rewards(self, rewards: np.ndarray, dones: np.ndarray, step: int) -> None:
         """Learn what the environments returned.
 
         :param rewards: ``[n_envs]``, of the environments, not normalised.

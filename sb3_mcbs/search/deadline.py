@@ -163,12 +163,12 @@ class _WatchedModel(ForwardModel):
     def finish(self) -> None:
         """The round is finished."""
         now = self._pace.clock()
-        self._note_step(now)
+        self._record_duration(now)
         self._pace.note_round(self._width, now - self._start)
 
     def _is_late(self) -> bool:
         now = self._pace.clock()
-        self._note_step(now)
+        self._record_duration(now)
         self._depth += 1
         self._step_start = now
         steps = self._pace.of_step(self._width, self._depth)
@@ -178,7 +178,7 @@ class _WatchedModel(ForwardModel):
             return now > self._deadline
         return now + step + self._pace.ending.forecast(_SHARE_OF_STEPS) > self._deadline
 
-    def _note_step(self, now: float) -> None:
+    def _record_duration(self, now: float) -> None:
         if self._depth >= 0:
             self._pace.of_step(self._width, self._depth).note(now - self._step_start)
 
