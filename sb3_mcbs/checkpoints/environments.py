@@ -16,6 +16,7 @@ from sb3_mcbs.checkpoints.files import file_of, read_written, write_again
 from sb3_mcbs.checkpoints.names import known_names
 from sb3_mcbs.snapshot import Snapshot, SnapshotEnvWrapper, SnapshotError
 from sb3_mcbs.snapshot.layers import CapturedLayer
+from sb3_mcbs.snapshot.mujoco import DataState, ModelState
 from sb3_mcbs.snapshot.replay import RecordedEpisode
 
 _Generators = dict[str, Any]
@@ -132,10 +133,5 @@ def _with_state(cls: Any, state: dict[str, Any]) -> Any:
 
 
 register_state(RecordedEpisode, tuple, lambda data: RecordedEpisode(*data))
-try:
-    from sb3_mcbs.snapshot.mujoco import DataState, ModelState
-except ImportError:  # MuJoCo is an optional part of Gymnasium
-    pass
-else:
-    for cls in (DataState, ModelState):
-        register_state(cls, cls.__getstate__, functools.partial(_with_state, cls))
+for cls in (DataState, ModelState):
+    register_state(cls, cls.__getstate__, functools.partial(_with_state, cls))
