@@ -223,12 +223,12 @@ class Buffers(Small):
     def prepare(self):
         self.log, self.bytes = io.StringIO(), io.BytesIO(b"abc")
         self.settings = {"gain": [1.0]}
-        self.captured = types.MappingProxyType(self.settings)
+        self.frozen = types.MappingProxyType(self.settings)
 
     def advance(self):
         self.bytes.read(1)
         self.settings["gain"][0] += 1
-        return self.log.write("x") + self.log.tell() + self.bytes.tell() + self.captured["gain"][0]
+        return self.log.write("x") + self.log.tell() + self.bytes.tell() + self.frozen["gain"][0]
 
 
 @pytest.mark.parametrize("cls", [Simulated, Frames, Game])
@@ -243,7 +243,7 @@ def test_buffers_and_views_of_dictionaries():
     for target in (env, env.clone()):
         target.restore(state)
         assert follow(target) == expected
-        assert target.unwrapped.captured["gain"] is target.unwrapped.settings["gain"]
+        assert target.unwrapped.frozen["gain"] is target.unwrapped.settings["gain"]
 
 
 class GlobalNoise(Small):
