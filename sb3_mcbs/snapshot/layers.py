@@ -187,7 +187,10 @@ def capture_attributes(
 
 def _capture_attribute(capture: Capture, env: Any, name: str, value: Any) -> Any:
     try:
-        return capture.part(value, "{}.{}", type(env).__name__, name)
+        return capture(value)
+    except SnapshotUnsupportedError as error:
+        error.path.insert(0, f"{type(env).__name__}.{name}")
+        raise
     except RecursionError as error:
         too_deep = SnapshotUnsupportedError("objects in it hold each other too many levels deep")
         too_deep.path.append(f"{type(env).__name__}.{name}")
