@@ -113,6 +113,40 @@ def test_spaces_that_are_edited():
     assert_same_future(Edited)
 
 
+def test_what_spaces_share_and_hold_besides_stays_so_in_clones():
+    class Rounded(spaces.Box):
+        """Holds a function with state, and a list."""
+
+        def __init__(self):
+            super().__init__(-1, 1, (2,), np.float64)
+            digits = [2]
+            self.digits, self.round = digits, lambda value: np.round(value, digits[0])
+
+        def sample(self, mask=None, probability=None):
+            return self.round(super().sample())
+
+    class Sharing(Small):
+        def prepare(self):
+            self.inner = Rounded()
+            self.outer = spaces.Dict({"a": self.inner, "b": spaces.Discrete(3)})
+            self.outer.seed(0)
+
+        def advance(self):
+            return float(self.inner.sample().sum()) + float(self.outer.sample()["a"].sum())
+
+    env = wrapped(Sharing)
+    follow(env, 3)
+    state, clone = env.snapshot(), env.clone()
+    expected = follow(env)
+    assert follow(clone) == expected
+    for target in (env, clone):
+        target.restore(state)
+        assert follow(target) == expected
+        assert target.unwrapped.outer["a"] is target.unwrapped.inner
+    clone.unwrapped.inner.digits[0] = 0
+    assert env.unwrapped.inner.digits == [2] and float(clone.unwrapped.inner.sample()[0]).is_integer()
+
+
 def test_the_action_space_of_the_environment():
     class Narrowing(Small):
         def advance(self):

@@ -1,4 +1,4 @@
-"""Clones: state that is captured, and restored where nothing is yet."""
+"""Clones: captured state that is restored where nothing is yet."""
 
 from typing import Any
 
@@ -14,9 +14,10 @@ from sb3_mcbs.snapshot.registry import find_adapter
 class Cloner:
     """Copies values; what is shared among them is shared among the copies.
 
-    Original and copy share what is not state, such as modules and fonts. A copy has no windows.
+    Original and copy share what is not state, such as modules and fonts. A copy has no windows. A space is
+    copied with all its attributes, as an ordinary object.
 
-    :param known: id of an object -> its node, for objects that the caller makes: put each into
+    :param known: id of an object -> its node, for objects that the caller makes and puts into
         ``restore.memo``.
     :param n_known: how many nodes those are, the first ones.
     """

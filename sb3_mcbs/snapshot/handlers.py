@@ -1,4 +1,4 @@
-"""The types of objects that environments hold, and how each is captured, restored and copied."""
+"""The types of objects that environments hold, and how each is captured and restored."""
 
 import ctypes
 import enum
@@ -92,7 +92,7 @@ class WindowHandler(ConstantHandler):
 
 
 class PartHandler(ConstantHandler):
-    """Parts of a simulator that it hands out, as ``data.body("torso")``: its state is theirs."""
+    """Parts that a simulator hands out, such as ``data.body("torso")``: their state is the simulator's."""
 
     name = "part"
 
@@ -227,9 +227,8 @@ def _decide(obj: Any, cls: type) -> TypeHandler | None:
         return None
     if find_adapter(obj) is not None:
         return HANDLERS["adapter"]
-    for known, name in _EXACT.items():
-        if cls is known:
-            return HANDLERS[name]
+    if cls in _EXACT:
+        return HANDLERS[_EXACT[cls]]
     if issubclass(cls, _CONSTANT_BASES):
         return HANDLERS["constant"]
     # A pointer class is made once, by whoever needs it first; what it points to says whose it is.

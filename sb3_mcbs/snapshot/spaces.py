@@ -1,4 +1,4 @@
-"""Spaces: what one contains, as plain values that can be compared and made a space again."""
+"""Spaces: their definitions, as plain values that can be compared and made into a space again."""
 
 import operator
 from collections.abc import Iterator
