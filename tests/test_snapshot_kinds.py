@@ -8,6 +8,7 @@ import queue
 import random
 import threading
 import types
+import weakref
 
 import gymnasium as gym
 import mujoco
@@ -17,7 +18,7 @@ import pytest
 import sympy
 from gymnasium import spaces
 
-from sb3_mcbs.snapshot import SnapshotEnvWrapper, SnapshotUnsupportedError
+from sb3_mcbs.snapshot import SnapshotEnvWrapper, SnapshotUnsupportedError, handlers
 from tests.test_snapshot_graph import Small, follow, wrapped
 
 
@@ -377,3 +378,13 @@ def test_a_copied_wrapper_knows_its_own_layers(duplicate):
         target.restore(state)
         assert target.unwrapped.me is target.unwrapped
         assert follow(target) == expected
+
+
+def test_a_weak_proxy_that_is_dead_when_it_is_first_met():
+    class Remembering(Small):
+        def prepare(self):
+            self.last = weakref.proxy(Small())
+
+    handlers._forget()
+    env, clone = assert_same_future(Remembering)
+    assert type(env.unwrapped.last) is type(clone.unwrapped.last) is weakref.ProxyType

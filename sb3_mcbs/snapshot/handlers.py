@@ -189,7 +189,7 @@ def handler_of(obj: Any) -> TypeHandler | None:
     handler = _handler_by_class.get(cls, _UNDECIDED)
     if handler is not _UNDECIDED:
         return handler
-    if isinstance(obj, type):  # classes differ from each other
+    if issubclass(cls, type):  # classes differ from each other
         handler = _handler_of_class.get(obj, _UNDECIDED)
         if handler is _UNDECIDED:
             handler = _handler_of_class[obj] = _decide_class(obj)
