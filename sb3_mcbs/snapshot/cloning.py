@@ -5,7 +5,7 @@ from typing import Any
 from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
 from sb3_mcbs.snapshot.handlers import HANDLERS, handler_of
 from sb3_mcbs.snapshot.object_graph import Capture, Ref, Restore, TypeHandler
-from sb3_mcbs.snapshot.objects import capture_content, restore_content
+from sb3_mcbs.snapshot.objects import attributes_of, capture_content, set_attributes
 from sb3_mcbs.snapshot.places import Places
 from sb3_mcbs.snapshot.pygame_values import is_display
 from sb3_mcbs.snapshot.registry import find_adapter
@@ -96,7 +96,10 @@ class _SimulatorHandler(Places):
         made = restore.memo[index] = adapter.clone(obj, self._cloner)
         self._copied.append((obj, made))
         if payload is not None:
-            restore_content(restore, payload, made, adapter.not_state)
+            # Those that it has already may be the original's.
+            values = {name: restore(value) for name, value in payload}
+            gone = attributes_of(made).keys() - values.keys() - adapter.not_state
+            restore.do_then(set_attributes, made, values, gone)
         return made
 
     def find(self, view: Any) -> Any:
