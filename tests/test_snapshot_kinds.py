@@ -8,6 +8,7 @@ import queue
 import random
 import threading
 import types
+import weakref
 
 import gymnasium as gym
 import mujoco
@@ -17,7 +18,7 @@ import pytest
 import sympy
 from gymnasium import spaces
 
-from sb3_mcbs.snapshot import SnapshotEnvWrapper, SnapshotUnsupportedError
+from sb3_mcbs.snapshot import SnapshotEnvWrapper, SnapshotUnsupportedError, handlers
 from tests.test_snapshot_graph import Small, follow, wrapped
 
 
@@ -111,6 +112,40 @@ def test_spaces_that_are_edited():
             return float(self.space.high.sum()) + len(self.choices)
 
     assert_same_future(Edited)
+
+
+def test_what_spaces_share_and_hold_besides_stays_so_in_clones():
+    class Rounded(spaces.Box):
+        """Holds a function with state, and a list."""
+
+        def __init__(self):
+            super().__init__(-1, 1, (2,), np.float64)
+            digits = [2]
+            self.digits, self.round = digits, lambda value: np.round(value, digits[0])
+
+        def sample(self, mask=None, probability=None):
+            return self.round(super().sample())
+
+    class Sharing(Small):
+        def prepare(self):
+            self.inner = Rounded()
+            self.outer = spaces.Dict({"a": self.inner, "b": spaces.Discrete(3)})
+            self.outer.seed(0)
+
+        def advance(self):
+            return float(self.inner.sample().sum()) + float(self.outer.sample()["a"].sum())
+
+    env = wrapped(Sharing)
+    follow(env, 3)
+    state, clone = env.snapshot(), env.clone()
+    expected = follow(env)
+    assert follow(clone) == expected
+    for target in (env, clone):
+        target.restore(state)
+        assert follow(target) == expected
+        assert target.unwrapped.outer["a"] is target.unwrapped.inner
+    clone.unwrapped.inner.digits[0] = 0
+    assert env.unwrapped.inner.digits == [2] and float(clone.unwrapped.inner.sample()[0]).is_integer()
 
 
 def test_the_action_space_of_the_environment():
@@ -343,3 +378,13 @@ def test_a_copied_wrapper_knows_its_own_layers(duplicate):
         target.restore(state)
         assert target.unwrapped.me is target.unwrapped
         assert follow(target) == expected
+
+
+def test_a_weak_proxy_that_is_dead_when_it_is_first_met():
+    class Remembering(Small):
+        def prepare(self):
+            self.last = weakref.proxy(Small())
+
+    handlers._forget()
+    env, clone = assert_same_future(Remembering)
+    assert type(env.unwrapped.last) is type(clone.unwrapped.last) is weakref.ProxyType

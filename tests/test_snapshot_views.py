@@ -3,6 +3,7 @@
 import pickle
 import threading
 import weakref
+from copy import copy as shallow_copy
 
 import gymnasium as gym
 import mujoco
@@ -208,6 +209,38 @@ def test_adapters_leave_ordinary_attributes_to_the_snapshot(monkeypatch):
     env.unwrapped.pump.file = threading.Lock()
     with pytest.raises(SnapshotUnsupportedError, match=r"Station\.pump\.file"):
         env.snapshot()
+
+
+def test_adapters_may_make_shallow_copies(monkeypatch):
+    class ShallowAdapter(PumpAdapter):
+        def clone(self, obj, copy):
+            return shallow_copy(obj)
+
+    class Valve:
+        strokes = 0
+
+    class Deep(Station):
+        def __init__(self):
+            super().__init__()
+            self.pump.valve = Valve()
+
+        def move(self, amount):
+            super().move(amount)
+            self.pump.valve.strokes += self.pump.strokes
+            self.pipe[0] += self.pump.valve.strokes
+
+    monkeypatch.setattr(registry, "_registered", [*registry._registered])
+    register_adapter(lambda obj: isinstance(obj, Pump), ShallowAdapter())
+    env = SnapshotEnvWrapper(Deep())
+    env.reset(seed=0)
+    env.step(ACTION)
+    state, clone = env.snapshot(), env.clone()
+    assert clone.unwrapped.pump.valve is not env.unwrapped.pump.valve
+    expected = future(env)
+    assert future(clone) == expected
+    for target in (env, clone):
+        target.restore(state)
+        assert future(target) == expected
 
 
 @pytest.mark.parametrize("form", ["dict", "tuple", "mixed"])

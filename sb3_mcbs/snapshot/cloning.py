@@ -1,11 +1,11 @@
-"""Clones: state that is captured, and restored where nothing is yet."""
+"""Clones: captured state that is restored where nothing is yet."""
 
 from typing import Any
 
 from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
 from sb3_mcbs.snapshot.handlers import HANDLERS, handler_of
 from sb3_mcbs.snapshot.object_graph import Capture, Ref, Restore, TypeHandler
-from sb3_mcbs.snapshot.objects import capture_content, restore_content
+from sb3_mcbs.snapshot.objects import attributes_of, capture_content, set_attributes
 from sb3_mcbs.snapshot.places import Places
 from sb3_mcbs.snapshot.pygame_values import is_display
 from sb3_mcbs.snapshot.registry import find_adapter
@@ -14,9 +14,10 @@ from sb3_mcbs.snapshot.registry import find_adapter
 class Cloner:
     """Copies values; what is shared among them is shared among the copies.
 
-    Original and copy share what is not state, such as modules and fonts. A copy has no windows.
+    Original and copy share what is not state, such as modules and fonts. A copy has no windows. A space is
+    copied with all its attributes, as an ordinary object.
 
-    :param known: id of an object -> its node, for objects that the caller makes: put each into
+    :param known: id of an object -> its node, for objects that the caller makes and puts into
         ``restore.memo``.
     :param n_known: how many nodes those are, the first ones.
     """
@@ -95,7 +96,10 @@ class _SimulatorHandler(Places):
         made = restore.memo[index] = adapter.clone(obj, self._cloner)
         self._copied.append((obj, made))
         if payload is not None:
-            restore_content(restore, payload, made, adapter.not_state)
+            # Those that it has already may be the original's.
+            values = {name: restore(value) for name, value in payload}
+            gone = attributes_of(made).keys() - values.keys() - adapter.not_state
+            restore.do_then(set_attributes, made, values, gone)
         return made
 
     def find(self, view: Any) -> Any:

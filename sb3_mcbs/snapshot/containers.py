@@ -4,6 +4,7 @@ import operator
 from collections import deque
 from typing import Any
 
+from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
 from sb3_mcbs.snapshot.object_graph import ATOMIC_CLASSES, MISSING, Capture, Ref, Restore
 
 
@@ -103,7 +104,14 @@ def capture_items(capture: Capture, items: Any) -> tuple[Any, ...]:
     """
     if ATOMIC_CLASSES.issuperset(map(type, items)):
         return tuple(items)
-    return tuple([capture.part(item, "[{}]", place) for place, item in enumerate(items)])
+    captured: list[Any] = []
+    try:
+        for item in items:
+            captured.append(capture(item))
+    except SnapshotUnsupportedError as error:
+        error.path.insert(0, f"[{len(captured)}]")
+        raise
+    return tuple(captured)
 
 
 class DictHandler:
@@ -112,10 +120,15 @@ class DictHandler:
     name = "dict"
 
     def capture(self, capture: Capture, obj: dict[Any, Any]) -> Any:
-        path = "[{!r}]"
-        return tuple(
-            [(capture.part(key, path, key), capture.part(value, path, key)) for key, value in obj.items()]
-        )
+        captured: list[Any] = []
+        key = None
+        try:
+            for key, value in obj.items():
+                captured.append((capture(key), capture(value)))
+        except SnapshotUnsupportedError as error:
+            error.path.insert(0, f"[{key!r}]")
+            raise
+        return tuple(captured)
 
     def restore(self, restore: Restore, index: int, payload: Any, current: Any) -> Any:
         made: dict[Any, Any] = {}

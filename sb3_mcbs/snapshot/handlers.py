@@ -1,4 +1,4 @@
-"""The types of objects that environments hold, and how each is captured, restored and copied."""
+"""The types of objects that environments hold, and how each is captured and restored."""
 
 import ctypes
 import enum
@@ -92,7 +92,7 @@ class WindowHandler(ConstantHandler):
 
 
 class PartHandler(ConstantHandler):
-    """Parts of a simulator that it hands out, as ``data.body("torso")``: its state is theirs."""
+    """Parts that a simulator hands out, such as ``data.body("torso")``: their state is the simulator's."""
 
     name = "part"
 
@@ -189,7 +189,7 @@ def handler_of(obj: Any) -> TypeHandler | None:
     handler = _handler_by_class.get(cls, _UNDECIDED)
     if handler is not _UNDECIDED:
         return handler
-    if isinstance(obj, type):  # classes differ from each other
+    if issubclass(cls, type):  # classes differ from each other
         handler = _handler_of_class.get(obj, _UNDECIDED)
         if handler is _UNDECIDED:
             handler = _handler_of_class[obj] = _decide_class(obj)
@@ -227,9 +227,8 @@ def _decide(obj: Any, cls: type) -> TypeHandler | None:
         return None
     if find_adapter(obj) is not None:
         return HANDLERS["adapter"]
-    for known, name in _EXACT.items():
-        if cls is known:
-            return HANDLERS[name]
+    if cls in _EXACT:
+        return HANDLERS[_EXACT[cls]]
     if issubclass(cls, _CONSTANT_BASES):
         return HANDLERS["constant"]
     # A pointer class is made once, by whoever needs it first; what it points to says whose it is.

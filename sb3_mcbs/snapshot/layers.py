@@ -45,14 +45,14 @@ class Layer(NamedTuple):
     """One layer.
 
     :param env: the wrapper or the environment.
-    :param cls: its class, or that of the wrapper in whose place it is.
+    :param cls: its class; of a stand-in, the class of the wrapper that it replaces.
     :param name: of its class; equal for classes whose states can be exchanged.
-    :param left_out: whether it only monitors, draws or records: in a copy a stand-in takes its place, and a
+    :param left_out: whether it only monitors, draws or records. A clone has a stand-in instead, and a
         snapshot holds what others have set on it.
     :param monitor: whether it is SB3's ``Monitor``; what that itself remembers is captured on request.
-    :param own: names of the attributes that such a layer itself sets, besides its stand-in's.
-    :param not_state: names of attributes that are not captured, these and the next included.
-    :param drawn: names of attributes for what an environment of Gymnasium draws on; there is none in a copy.
+    :param own: names of the attributes that a left-out layer sets itself; its stand-in has none of them.
+    :param not_state: names of attributes that are not captured, ``own`` and ``drawn`` included.
+    :param drawn: names of the attributes that an environment of Gymnasium draws on; None in a clone.
     :param adapter: what captures its simulator, if an adapter is registered for it.
     """
 
@@ -187,7 +187,10 @@ def capture_attributes(
 
 def _capture_attribute(capture: Capture, env: Any, name: str, value: Any) -> Any:
     try:
-        return capture.part(value, "{}.{}", type(env).__name__, name)
+        return capture(value)
+    except SnapshotUnsupportedError as error:
+        error.path.insert(0, f"{type(env).__name__}.{name}")
+        raise
     except RecursionError as error:
         too_deep = SnapshotUnsupportedError("objects in it hold each other too many levels deep")
         too_deep.path.append(f"{type(env).__name__}.{name}")

@@ -85,7 +85,7 @@ def restore_content(
 
 
 def _set_changed(obj: Any, values: dict[str, Any], gone: Iterable[str]) -> None:
-    """Set those attributes that are others by now: some classes do not let theirs be set."""
+    """Set only the attributes that changed: some classes do not let theirs be set."""
     have = attributes_of(obj)
     set_attributes(
         obj, {name: value for name, value in values.items() if have.get(name, MISSING) is not value}, gone
@@ -107,8 +107,8 @@ def blank(cls: type) -> Any:
 def _is_value(cls: type) -> bool:
     """Return whether objects of a class are hashed by what they hold.
 
-    Sets and dictionaries look them up by that, so that they must be complete from the start, and none that is
-    there may be changed.
+    Sets and dictionaries look them up by their hash. So they have to be complete from the start, and existing
+    ones must not be changed.
     """
     return cls.__hash__ is not None and cls.__hash__ is not object.__hash__
 
@@ -116,7 +116,7 @@ def _is_value(cls: type) -> bool:
 def _made_anew(restore: Restore, index: int, cls: type, attributes: Any, have: dict[str, Any]) -> Any:
     """Make an object and set its attributes at once.
 
-    Those that a hash is computed from come first: on the way to the others may be a set that it is in.
+    Those that its hash is computed from come first: the others may lead to a set that holds the object.
     """
     made: Any = blank(cls)
     restore.memo[index] = made
@@ -144,7 +144,7 @@ def _setter(obj: Any) -> Callable[[str, Any], None]:
 
 
 def _set_in_order(obj: Any, values: dict[str, Any]) -> None:
-    """Set attributes that have been set already, in the order that they shall be listed in."""
+    """Set attributes again, in the order in which they are to be listed."""
     if type(obj).__dictoffset__:
         obj.__dict__.clear()
     set_attributes(obj, values)

@@ -1,7 +1,7 @@
 """Views into simulators, named by where they lie in them.
 
-What a view shows is the simulator's state. Which view an environment holds is its own: one that keeps
-``data.xpos[target]`` exchanges it when it chooses another target.
+The content of a view is the simulator's state. Which view an environment holds is its own state: one that
+keeps ``data.xpos[target]`` exchanges it when it chooses another target.
 """
 
 import operator

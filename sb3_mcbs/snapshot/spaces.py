@@ -1,4 +1,4 @@
-"""Spaces: what one contains, as plain values that can be compared and made a space again."""
+"""Spaces: their definitions, as plain values that can be compared and made into a space again."""
 
 import operator
 from collections.abc import Iterator
@@ -21,7 +21,10 @@ _SMALL = 1024
 
 def _parts_of(space: spaces.Space) -> list[spaces.Space]:
     """Return a space and the spaces in it."""
-    return [space, *(part for inner in _inner(space) for part in _parts_of(inner))]
+    parts = [space]
+    for inner in _inner(space):
+        parts += _parts_of(inner)
+    return parts
 
 
 def _inner(space: spaces.Space) -> list[spaces.Space]:
@@ -55,6 +58,8 @@ class _Known:
         if self._contents != [bounds.tobytes() for bounds in self._bounds]:
             return False
         inner = _inner(space)
+        if not (inner or self._inner):
+            return True
         return len(inner) == len(self._inner) and all(
             one is other and _definition_of(one) is definition
             for one, (other, definition) in zip(inner, self._inner, strict=True)

@@ -1,4 +1,4 @@
-"""The state of a stack of layers: captured, checked, put back, cloned."""
+"""The layers of one environment as a whole: captured, checked, put back, cloned."""
 
 import contextlib
 import operator
@@ -83,7 +83,7 @@ class Stack:
 
     @contextlib.contextmanager
     def bare(self) -> Iterator[None]:
-        """Monitor, record and draw nothing while it is entered. After that, all is as it was."""
+        """Neither monitor, record nor draw inside, and put everything back afterwards."""
         state = self.capture(monitor=False)
         left_out = [layer for layer in self.layers if layer.left_out]
         classes = [type(layer.env) for layer in left_out]
@@ -251,7 +251,7 @@ class Stack:
         restore.commit()
 
     def clone(self) -> gym.Env[Any, Any]:
-        """Copy the layers; those that only monitor, draw or record are stand-ins in the copy.
+        """Copy the layers, with stand-ins for those that only monitor, draw or record.
 
         :return: the outermost layer of the copy.
         """

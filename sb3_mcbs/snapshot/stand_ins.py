@@ -1,4 +1,4 @@
-"""What takes the place of wrappers that copies are made without: SB3's ``Monitor``, and those that record."""
+"""Stand-ins for the wrappers that clones leave out: SB3's ``Monitor``, and those that draw or record."""
 
 import dis
 import functools
@@ -24,7 +24,7 @@ _LEFT_OUT = frozenset(
 
 @functools.lru_cache(maxsize=256)
 def left_out_class(cls: type) -> type | None:
-    """Return which of the wrappers that copies are made without a class is, or derives from.
+    """Return the wrapper that clones leave out and that a class is or derives from, None if there is none.
 
     :param cls: the class of a wrapper.
     """
@@ -47,7 +47,7 @@ def set_by(cls: type) -> frozenset[str]:
 
 
 class StandIn(gym.Wrapper[Any, Any, Any, Any]):
-    """Takes a wrapper's place in a copy. It holds what others have set on that, and does nothing itself."""
+    """Replaces a wrapper in a clone: holds what others have set on the wrapper, and does nothing itself."""
 
     stands_for: type
 
@@ -68,9 +68,9 @@ def _blank(cls: type) -> Any:
 
 @functools.lru_cache(maxsize=64)
 def stand_in(cls: type) -> type[StandIn]:
-    """Return the class of what takes a wrapper's place.
+    """Return the class of the stand-in for a wrapper.
 
-    :param cls: the wrapper's class. What a derived class does besides the one that it derives from stays.
+    :param cls: the wrapper's class. What a derived class adds to the left-out one goes on working.
     """
     known = left_out_class(cls)
     assert known is not None
@@ -105,7 +105,7 @@ def bound(function: Any, owner: Any) -> Any:
 
 
 def _exchanged(function: Any, cls: type, other: type) -> Any:
-    """Return what another class has for a method of one; a function that is none of its methods stays."""
+    """Return the method of ``other`` that replaces a method of ``cls``; any other function stays."""
     name, code = getattr(function, "__name__", ""), getattr(function, "__code__", None)
     if code is None or getattr(getattr(cls, name, None), "__code__", None) is not code:
         return function

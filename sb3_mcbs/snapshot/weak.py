@@ -36,7 +36,7 @@ def _referent(proxy: Any) -> Any:
 
 
 class _Gone:
-    """Of which nothing is left."""
+    """What a dead reference referred to: its objects are gone at once."""
 
 
 class WeakrefHandler:
