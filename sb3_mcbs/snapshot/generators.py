@@ -2,12 +2,12 @@
 
 import functools
 import random
-import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
+import torch as th
 
 from sb3_mcbs.snapshot.object_graph import MISSING, Capture, Node, Ref, Restore
 
@@ -24,7 +24,7 @@ _FIRST_OTHER_CHILD = 2**30
 _GLOBALS: dict[str, Callable[[], Any]] = {
     "numpy": lambda: np.random.mtrand._rand,
     "python": lambda: random._inst,
-    "torch": lambda: getattr(sys.modules.get("torch"), "default_generator", None),
+    "torch": lambda: th.default_generator,
 }
 
 
@@ -35,8 +35,7 @@ def is_generator(obj: Any) -> bool:
     """
     if isinstance(obj, _CLASSES):
         return not isinstance(obj, random.SystemRandom)
-    torch = sys.modules.get("torch")
-    return torch is not None and isinstance(obj, torch.Generator)
+    return isinstance(obj, th.Generator)
 
 
 class GeneratorHandler:
@@ -267,8 +266,7 @@ def _set_state(generator: Any, state: Any) -> None:
     elif isinstance(bits, random.Random):
         bits.setstate(state)
     else:
-        torch = sys.modules["torch"]
-        bits.set_state(torch.frombuffer(bytearray(state), dtype=torch.uint8))
+        bits.set_state(th.frombuffer(bytearray(state), dtype=th.uint8))
 
 
 def _reseed(generator: Any, rng: np.random.Generator, seeds: _Seeds | None = _NO_SEEDS) -> None:
@@ -314,9 +312,7 @@ def _four_numbers(rng: np.random.Generator) -> list[int]:
 
 def global_states() -> tuple[Any, ...]:
     """Read the states of the process's generators: Python's, NumPy's, torch's."""
-    torch: Any = sys.modules.get("torch")
-    torch_state = None if torch is None else torch.get_rng_state()
-    return random.getstate(), np.random.get_state(), torch_state
+    return random.getstate(), np.random.get_state(), th.get_rng_state()
 
 
 def seed_globals(seed: int) -> None:
@@ -326,9 +322,7 @@ def seed_globals(seed: int) -> None:
     """
     random.seed(seed)
     np.random.seed(seed)
-    torch: Any = sys.modules.get("torch")
-    if torch is not None:
-        torch.default_generator.manual_seed(seed)
+    th.default_generator.manual_seed(seed)
 
 
 @contextmanager
@@ -340,8 +334,7 @@ def globals_kept() -> Iterator[None]:
     finally:
         random.setstate(python_state)
         np.random.set_state(numpy_state)
-        if torch_state is not None:
-            sys.modules["torch"].set_rng_state(torch_state)
+        th.set_rng_state(torch_state)
 
 
 @contextmanager

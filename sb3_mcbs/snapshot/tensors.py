@@ -1,9 +1,9 @@
 """Tensors of torch: captured by value; those that share memory go on sharing it."""
 
-import sys
 from typing import Any
 
 import numpy as np
+import torch as th
 
 from sb3_mcbs.snapshot.errors import SnapshotUnsupportedError
 from sb3_mcbs.snapshot.object_graph import MISSING, Capture, Ref, Restore, class_name
@@ -11,12 +11,11 @@ from sb3_mcbs.snapshot.objects import capture_content, restore_content
 
 
 def is_tensor(obj: Any) -> bool:
-    """Return whether an object is a tensor; does not import torch.
+    """Return whether an object is a tensor.
 
     :param obj: any object.
     """
-    torch = sys.modules.get("torch")
-    return torch is not None and isinstance(obj, torch.Tensor)
+    return isinstance(obj, th.Tensor)
 
 
 def bytes_of(tensor: Any) -> np.ndarray:
@@ -29,8 +28,7 @@ def bytes_of(tensor: Any) -> np.ndarray:
 
 def _whole(tensor: Any) -> Any:
     """Return the whole memory of a tensor, as a tensor of bytes."""
-    torch: Any = sys.modules["torch"]
-    return torch.empty(0, dtype=torch.uint8, device=tensor.device).set_(tensor.untyped_storage())
+    return th.empty(0, dtype=th.uint8, device=tensor.device).set_(tensor.untyped_storage())
 
 
 class TensorHandler:
@@ -75,9 +73,8 @@ def _storage_of(tensor: Any) -> Any:
 
     :raises SnapshotUnsupportedError: if it cannot be captured.
     """
-    torch: Any = sys.modules["torch"]
     cls = type(tensor)
-    if cls not in (torch.Tensor, torch.nn.Parameter) or tensor.layout is not torch.strided:
+    if cls not in (th.Tensor, th.nn.Parameter) or tensor.layout is not th.strided:
         raise SnapshotUnsupportedError(f"a {class_name(cls)} of layout {tensor.layout} is no plain tensor")
     # Their memory alone does not say what they contain.
     for name in ("quantized", "nested", "meta", "conj", "neg"):
@@ -115,7 +112,7 @@ def _span(storage: Any) -> tuple[int, int]:
 
 def _layout(tensor: Any) -> tuple[Any, ...]:
     """Return how a tensor lies in its memory, as plain values."""
-    is_parameter = isinstance(tensor, sys.modules["torch"].nn.Parameter)
+    is_parameter = isinstance(tensor, th.nn.Parameter)
     place = tensor.storage_offset(), tuple(tensor.shape), tensor.stride()
     dtype = str(tensor.dtype).removeprefix("torch.")
     return is_parameter, dtype, str(tensor.device), tensor.requires_grad, *place
@@ -128,15 +125,14 @@ def _can_be_put_back(current: Any, layout: tuple[Any, ...], content: np.ndarray)
 
 
 def _write(tensor: Any, content: np.ndarray) -> None:
-    _whole(tensor).copy_(sys.modules["torch"].tensor(content))
+    _whole(tensor).copy_(th.tensor(content))
 
 
 def _storage(content: np.ndarray, layout: tuple[Any, ...]) -> Any:
-    return sys.modules["torch"].tensor(content, device=layout[2]).untyped_storage()
+    return th.tensor(content, device=layout[2]).untyped_storage()
 
 
 def _tensor(storage: Any, layout: tuple[Any, ...]) -> Any:
-    torch: Any = sys.modules["torch"]
     is_parameter, dtype, device, requires_grad, *place = layout
-    made = torch.empty(0, dtype=getattr(torch, dtype), device=device).set_(storage, *place)
-    return torch.nn.Parameter(made, requires_grad) if is_parameter else made.requires_grad_(requires_grad)
+    made = th.empty(0, dtype=getattr(th, dtype), device=device).set_(storage, *place)
+    return th.nn.Parameter(made, requires_grad) if is_parameter else made.requires_grad_(requires_grad)
