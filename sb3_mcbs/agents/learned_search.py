@@ -8,7 +8,7 @@ import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_mcbs.agents.learned_model import LearnedModel
+from sb3_mcbs.agents.learned_model import EnsembleSettings, LearnedModel
 from sb3_mcbs.agents.observation_pipeline import ObservationPipeline
 from sb3_mcbs.agents.planner import Planner
 from sb3_mcbs.models.ensemble import Transitions
@@ -42,8 +42,8 @@ def make_planner(
 class LearnedPlanner(Planner):
     """Searches from the agent's observations by the model that the agent learned.
 
-    The environments may be of any kind: they are neither wrapped nor copied. A refinement starts anew at
-    every decision, since observations do not tell which steps were taken since the last one.
+    The environments may be of any kind: they are neither wrapped nor copied. The cross-entropy method starts
+    anew at every decision, since observations do not tell which steps were taken since the last one.
 
     :param agent: an agent that learns a model, or has learned one.
     :param vec_env: the environments.
@@ -63,7 +63,7 @@ class LearnedPlanner(Planner):
         self._all_envs = range(self._vec_env.num_envs)
         ensemble = self._learned_model.ensemble
         self._ensemble_model = EnsembleModel(
-            ensemble, agent.observation_space, agent.action_space, agent.ensemble_pessimism
+            ensemble, agent.observation_space, agent.action_space, self._model_settings.ensemble_pessimism
         )
         self.model = self._ensemble_model
 
@@ -79,9 +79,12 @@ class LearnedPlanner(Planner):
         return learned
 
     @property
+    def _model_settings(self) -> EnsembleSettings:
+        return EnsembleSettings.of(self.agent)
+
+    @property
     def ready(self) -> bool:
-        agent: Any = self.agent
-        return self._learned_model.ensemble.held_out_error <= agent.ensemble_max_error
+        return self._learned_model.ensemble.held_out_error <= self._model_settings.ensemble_max_error
 
     def search(
         self,
@@ -91,9 +94,8 @@ class LearnedPlanner(Planner):
         effort: SearchSettings | None = None,
     ) -> SearchResult:
         if self.ready:
-            agent: Any = self.agent
             self._ensemble_model.ensemble = self._learned_model.ensemble
-            self._ensemble_model.pessimism = agent.ensemble_pessimism
+            self._ensemble_model.pessimism = self._model_settings.ensemble_pessimism
             return super().search(observations, rng, envs, effort)
         if not self._said_not_ready:
             self._said_not_ready = True
@@ -101,7 +103,7 @@ class LearnedPlanner(Planner):
                 "The learned model is not used yet: its held-out error is %.3g, above "
                 "ensemble_max_error=%.3g. The policy acts alone.",
                 self._learned_model.ensemble.held_out_error,
-                self.agent.ensemble_max_error,  # type: ignore[attr-defined]
+                self._model_settings.ensemble_max_error,
             )
         return self._policy_alone(observations, envs)
 

@@ -29,6 +29,8 @@ from sb3_mcbs.networks.functions import (
 )
 from sb3_mcbs.networks.torch_settings import matmul_precision, one_thread
 from sb3_mcbs.search import (
+    BeamSettings,
+    CEMSettings,
     Decision,
     EpisodeClock,
     LatencyForecast,
@@ -125,7 +127,7 @@ class Planner(InOwnEnvironments):
         if model is not None:
             check_dynamics(settings, model.deterministic)
         plans = self._plans
-        if settings.strategy != "refine":
+        if not isinstance(settings, CEMSettings):
             plans = None
         elif plans is None or settings.horizon != self.settings.horizon:
             plans = WarmStart(self._vec_env.num_envs, settings.horizon, self._act_dim)
@@ -194,7 +196,7 @@ class Planner(InOwnEnvironments):
         dims = settings.proposal_dims
         directions = None if dims is None else self.recent_actions.directions(dims)
         with one_thread(), matmul_precision(settings.matmul_precision):
-            if settings.time_budget is None:
+            if not isinstance(settings, BeamSettings) or settings.time_budget is None:
                 shape = (n_rows(observations), self._act_dim)
                 decision = Decision(self.model, roots, observations, agent, settings, shape, rng)
                 decision = decision._replace(directions=directions)

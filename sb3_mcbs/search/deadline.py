@@ -10,7 +10,7 @@ import numpy as np
 from sb3_mcbs.search.beam import OutOfTimeError, choose, join_rounds, rollout_values
 from sb3_mcbs.search.interface import CountedValue, FirstStep, PolicyFunctions, SearchResult
 from sb3_mcbs.search.proposals import draw_noise, propose, without_first
-from sb3_mcbs.search.settings import SearchSettings
+from sb3_mcbs.search.strategy_settings import BeamSettings
 from sb3_mcbs.types import ForwardModel, Observations
 
 #: How many past durations a forecast looks at, and which share of them it covers: of rounds, and of single
@@ -151,7 +151,7 @@ def deadline_search(
     roots: Sequence[Any],
     observations: Observations,
     functions: PolicyFunctions,
-    settings: SearchSettings,
+    settings: BeamSettings,
     deadline: float,
     pace: LatencyForecast,
     rng: np.random.Generator,

@@ -66,7 +66,7 @@ class SearchResult(NamedTuple):
     :param chosen: ``[n_envs]``, which candidate that is; -1 where every candidate was invalid and the
         policy's own action was taken.
     :param candidates: ``[n_envs, beam, act_dim]``, all that were simulated: of a tree the root actions, of a
-        refinement the first actions of all its rounds.
+        cross-entropy method the first actions of all its rounds.
     :param values: ``[n_envs, beam]``, Q~_i; -inf where a simulation of the candidate was invalid. In a tree
         a root action that was dropped keeps the value with which it was dropped.
     :param first_step: the chosen candidates' first simulated step (of their first simulation);

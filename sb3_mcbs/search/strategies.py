@@ -1,4 +1,4 @@
-"""The strategies by their names, behind one way to call them."""
+"""The strategies by the classes of their settings, behind one way to call them."""
 
 import logging
 from collections.abc import Callable, Sequence
@@ -7,10 +7,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sb3_mcbs.search.beam import beam_search
+from sb3_mcbs.search.cem import cem_search, draw_plan_noise
 from sb3_mcbs.search.interface import CountedValue, PolicyFunctions, SearchResult
 from sb3_mcbs.search.proposals import draw_noise
-from sb3_mcbs.search.refine import draw_plan_noise, refine_search
 from sb3_mcbs.search.settings import SearchSettings
+from sb3_mcbs.search.strategy_settings import BeamSettings, CEMSettings, TreeSettings
 from sb3_mcbs.search.tree import draw_tree_noise, tree_search
 from sb3_mcbs.search.warm_start import EpisodeClock, WarmStart
 from sb3_mcbs.types import ForwardModel, Observations
@@ -28,7 +29,7 @@ class Decision(NamedTuple):
     :param settings: settings of the search.
     :param shape: ``(n_envs, act_dim)``.
     :param rng: of the search: draws all noise, and is given to a model with random dynamics.
-    :param memory: of the strategy ``"refine"``.
+    :param memory: of the cross-entropy method.
     :param envs: the environments that decide, by their numbers in the memory.
     :param clocks: the present moment of each, for the memory.
     :param directions: ``[proposal_dims, act_dim]``, in which candidates differ; ``None``: in all.
@@ -48,13 +49,13 @@ class Decision(NamedTuple):
 
 
 def search(decision: Decision) -> SearchResult:
-    """Choose one action per environment by the strategy that the settings name.
+    """Choose one action per environment by the strategy that the settings are of.
 
     :param decision: what there is to decide.
     :return: actions, and what the search found.
     """
     value = CountedValue(decision.functions.value)
-    strategy = STRATEGIES[decision.settings.strategy]
+    strategy = _STRATEGIES[type(decision.settings)]
     result = strategy(decision._replace(functions=decision.functions._replace(value=value)))
     return result._replace(critic_evaluations=value.evaluations)
 
@@ -66,7 +67,7 @@ def check_dynamics(settings: SearchSettings, deterministic: bool) -> None:
     :param deterministic: whether the environment's steps are.
     :raises ValueError: if the search would follow the luckiest random draw.
     """
-    if not deterministic and settings.strategy != "beam" and settings.n_simulations == 1:
+    if not deterministic and not isinstance(settings, BeamSettings) and settings.n_simulations == 1:
         raise ValueError(
             f"strategy={settings.strategy!r} needs n_simulations of 2 or more here: the environment's steps "
             "are random, and with one simulation the luckiest draw would win."
@@ -90,24 +91,30 @@ def _beam(decision: Decision) -> SearchResult:
 
 
 def _tree(decision: Decision) -> SearchResult:
-    assert decision.model is not None, "a tree needs a forward model"
-    noise = draw_tree_noise(decision.rng, decision.settings, *decision.shape, decision.directions)
-    return tree_search(decision.model, *decision[1:5], noise, decision.rng)
+    model, roots, observations, functions, settings, shape, rng = decision[:7]
+    assert model is not None and isinstance(settings, TreeSettings)
+    noise = draw_tree_noise(rng, settings, *shape, decision.directions)
+    return tree_search(model, roots, observations, functions, settings, noise, rng)
 
 
-def _refine(decision: Decision) -> SearchResult:
-    assert decision.model is not None, "a refinement needs a forward model"
-    assert decision.memory is not None, "a refinement remembers its plans"
-    noise = draw_plan_noise(decision.rng, decision.settings, *decision.shape)
-    hold = decision.settings.noise_hold
+def _cem(decision: Decision) -> SearchResult:
+    model, roots, observations, functions, settings, shape, rng = decision[:7]
+    assert model is not None and isinstance(settings, CEMSettings)
+    assert decision.memory is not None, "the cross-entropy method remembers its plans"
+    noise = draw_plan_noise(rng, settings, *shape)
+    hold = settings.noise_hold
     # The present macro-steps need not begin where those of the last decision did.
     by_step = decision.memory.recall(decision.envs, decision.clocks)
     remembered = by_step.reshape(len(by_step), -1, hold, by_step.shape[2]).mean(axis=2)
-    result, plans = refine_search(
-        decision.model, *decision[1:5], noise, decision.rng, remembered, decision.directions
+    result, plans = cem_search(
+        model, roots, observations, functions, settings, noise, rng, remembered, decision.directions
     )
     decision.memory.keep(np.repeat(plans, hold, axis=1), decision.envs, decision.clocks)
     return result
 
 
-STRATEGIES: dict[str, Callable[[Decision], SearchResult]] = {"beam": _beam, "tree": _tree, "refine": _refine}
+_STRATEGIES: dict[type[SearchSettings], Callable[[Decision], SearchResult]] = {
+    BeamSettings: _beam,
+    TreeSettings: _tree,
+    CEMSettings: _cem,
+}

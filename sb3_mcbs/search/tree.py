@@ -23,7 +23,7 @@ from sb3_mcbs.search.proposals import (
     scale,
     without_first,
 )
-from sb3_mcbs.search.settings import SearchSettings
+from sb3_mcbs.search.strategy_settings import TreeSettings
 from sb3_mcbs.types import ForwardModel, Observations, take_rows
 
 
@@ -83,7 +83,7 @@ class _Growth(NamedTuple):
 
 def draw_tree_noise(
     rng: np.random.Generator,
-    settings: SearchSettings,
+    settings: TreeSettings,
     n_envs: int,
     act_dim: int,
     directions: np.ndarray | None = None,
@@ -112,7 +112,7 @@ def tree_search(
     roots: Sequence[Any],
     observations: Observations,
     functions: PolicyFunctions,
-    settings: SearchSettings,
+    settings: TreeSettings,
     noise: TreeNoise,
     rng: np.random.Generator,
 ) -> SearchResult:
@@ -189,7 +189,7 @@ def _children(
     drawn: np.ndarray,
     children: int,
     functions: PolicyFunctions,
-    settings: SearchSettings,
+    settings: TreeSettings,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Propose actions in every simulation that goes on.
 
@@ -223,7 +223,7 @@ def _grow(
     children: int,
     steps_before: int,
     functions: PolicyFunctions,
-    settings: SearchSettings,
+    settings: TreeSettings,
 ) -> _Growth:
     """Step the children, whose rows the forward model holds, for a macro-step, and value them.
 
