@@ -218,7 +218,15 @@ def test_where_the_schedule_starts_to_leave_the_search_out_the_actor_explores(ma
     assert agent.n_decisions == 10 and 0.02 < noise.std() < 0.3
 
 
-@pytest.mark.parametrize("changes", [dict(beam_width=5), dict(strategy="cem"), dict(search_share=0.3)])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        dict(beam_width=5),
+        dict(strategy="cem"),
+        dict(search_kwargs=dict(antithetic=True)),
+        dict(search_share=0.3),
+    ],
+)
 def test_a_resumed_run_goes_on_with_the_changed_settings(tmp_path, changes):
     def make(folder):
         env = snapshot_vec_env("Pendulum-v1")

@@ -26,32 +26,17 @@ class MCBSDDPG(MCBS, FastUpdate, DDPG):
     What is simulated needs environments in :class:`~sb3_mcbs.SnapshotEnvWrapper`: the algorithm wraps them
     itself, except in a ``SubprocVecEnv``, where they must be wrapped when they are made.
 
-    :param policy: The policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy)
-    :param env: The environment to learn from (if registered in Gymnasium, can be str)
-    :param learning_rate: learning rate for the Adam optimizers, a constant or a function of the remaining
-        progress (from 1 to 0)
-    :param buffer_size: size of the replay buffer
+    The parameters before ``beam_width`` are those of :class:`~stable_baselines3.DDPG`. What there is to
+    say of them here:
+
     :param learning_starts: how many steps of the model to collect transitions for before learning, and
         searching, starts
-    :param batch_size: Minibatch size for each gradient update
-    :param tau: the soft update coefficient ("Polyak update", between 0 and 1)
     :param gamma: the discount factor, of the critics and of the rollouts
-    :param train_freq: Update the model every ``train_freq`` steps, or a tuple like ``(5, "step")`` or
-        ``(2, "episode")``
-    :param gradient_steps: How many gradient steps to do after each rollout; -1 means as many as steps done
     :param action_noise: noise on actions chosen without search (before ``learning_starts`` and where
         the schedule leaves the search out). Searched actions are executed as they are unless
         ``action_noise_after_search`` is set.
-    :param replay_buffer_class: Replay buffer class to use (for instance ``HerReplayBuffer``)
-    :param replay_buffer_kwargs: Keyword arguments to pass to the replay buffer on creation
-    :param optimize_memory_usage: Enable a memory efficient variant of the replay buffer
-    :param n_steps: number of steps of n-step returns in the critic's target
-    :param tensorboard_log: the log location for tensorboard (if None, no logging)
-    :param policy_kwargs: additional arguments to be passed to the policy on creation
-    :param verbose: Verbosity level: 0 for no output, 1 for info messages, 2 for debug messages
     :param seed: Seed for the pseudo random generators, the search's own included
     :param device: Device (cpu, cuda, ...) on which the networks run; simulation is on the CPU
-    :param _init_setup_model: Whether or not to build the network at the creation of the instance
     :param beam_width: number of candidate actions per decision (None: the preset's, or 6)
     :param rollout_depth: simulated steps per rollout; 0 ranks by the critics alone (None: the preset's, or 3)
     :param n_simulations: rollouts per candidate (None: the preset's, or 5)
