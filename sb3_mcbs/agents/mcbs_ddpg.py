@@ -35,6 +35,7 @@ class MCBSDDPG(MCBS, FastUpdate, DDPG):
     :param action_noise: noise on actions chosen without search (before ``learning_starts`` and where
         the schedule leaves the search out). Searched actions are executed as they are unless
         ``action_noise_after_search`` is set.
+    :param tensorboard_log: the log location for tensorboard (if None, no logging)
     :param seed: Seed for the pseudo random generators, the search's own included
     :param device: Device (cpu, cuda, ...) on which the networks run; simulation is on the CPU
     :param beam_width: number of candidate actions per decision (None: the preset's, or 6)
