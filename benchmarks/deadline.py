@@ -20,7 +20,7 @@ def measure(env_id: str, budget: float, decisions: int) -> dict[str, Any]:
     """
     env = make_vec_env(env_id, 1, seed=0)
     agent = MCBSTD3("MlpPolicy", env, policy_kwargs=NETWORKS, seed=0, device="cpu", buffer_size=1000)
-    policy = SearchPolicy(agent, env, seed=0, time_budget=budget, max_beam_width=1000)
+    policy = SearchPolicy(agent, env, seed=0, search_kwargs=dict(time_budget=budget, max_beam_width=1000))
     observations: Any = env.reset()
     seconds, rounds, candidates = [], [], []
     for number in range(decisions + decisions // 10):

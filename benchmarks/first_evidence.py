@@ -26,10 +26,16 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from sb3_mcbs.zoo.repeat import load_run
 from sb3_mcbs.zoo.report import ACTOR, SEARCH, load_policies
 
-SEARCH_SETTINGS = {"beam_width": 6, "rollout_depth": 3, "n_simulations": 5, "beam_noise": 0.1, "n_threads": 1}
+SEARCH_SETTINGS = {
+    "beam_width": 6,
+    "rollout_depth": 3,
+    "n_simulations": 5,
+    "beam_noise": 0.1,
+    "model_kwargs": {"n_threads": 1},
+}
 HYPERPARAMS = {
     "td3": [f"search_evaluation:{SEARCH_SETTINGS}"],
-    "mcbs_td3": ["preset:'paper'", "n_threads:1"],
+    "mcbs_td3": ["preset:'paper'", "model_kwargs:dict(n_threads=1)"],
 }
 LABELS = {"td3": "TD3", "mcbs_td3": "MCBS-TD3"}
 COLORS = {

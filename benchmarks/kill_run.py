@@ -44,24 +44,24 @@ CASES = {
     "Pendulum-v1 in workers": Case("Pendulum-v1", 4, normalized=True),
 }
 ALGORITHMS: dict[str, tuple[type[OffPolicyAlgorithm], dict[str, Any]]] = {
-    "mcbs_td3": (MCBSTD3, {"n_threads": 1}),
-    "mcbs_ddpg": (MCBSDDPG, {"n_threads": 1}),
-    "mcbs_sac": (MCBSSAC, {"n_threads": 1, "use_sde": True, "search_share": 0.5}),
-    "mcbs_tqc": (MCBSTQC, {"n_threads": 1, "preset": "balanced"}),
+    "mcbs_td3": (MCBSTD3, {"model_kwargs": {"n_threads": 1}}),
+    "mcbs_ddpg": (MCBSDDPG, {"model_kwargs": {"n_threads": 1}}),
+    "mcbs_sac": (MCBSSAC, {"model_kwargs": {"n_threads": 1}, "use_sde": True, "search_share": 0.5}),
+    "mcbs_tqc": (MCBSTQC, {"model_kwargs": {"n_threads": 1}, "preset": "balanced"}),
     "mcbs_td3 with schedules": (
         MCBSTD3,
         {
-            "n_threads": 1,
+            "model_kwargs": {"n_threads": 1},
             "search_schedule": "saturation",
             "search_unit": "episode",
             "search_share": 0.7,
-            "saturation_window": 1000,
+            "schedule_kwargs": {"saturation_window": 1000},
         },
     ),
     "mcbs_td3 with expanded targets": (
         MCBSTD3,
         {
-            "n_threads": 1,
+            "model_kwargs": {"n_threads": 1},
             "preset": "efficient",
             "search_unit": "episode",
             "search_share": 0.5,
@@ -71,7 +71,11 @@ ALGORITHMS: dict[str, tuple[type[OffPolicyAlgorithm], dict[str, Any]]] = {
     # An error that it is allowed from the first fit, so that the searches use it.
     "mcbs_td3 with a learned model": (
         MCBSTD3,
-        {"n_threads": 1, "preset": "efficient", "forward_model": "ensemble", "ensemble_max_error": 10.0},
+        {
+            "model_kwargs": {"n_threads": 1, "ensemble_max_error": 10.0},
+            "preset": "efficient",
+            "forward_model": "ensemble",
+        },
     ),
     "td3": (TD3, {}),
     "sac": (SAC, {}),

@@ -52,9 +52,10 @@ def make_agent(args: argparse.Namespace) -> Any:
     }
     if ARMS[args.arm] is None:
         return PlainTD3("MlpPolicy", env, **settings)
-    settings |= {"preset": "efficient", "n_threads": 1, "forward_model": ARMS[args.arm]}
+    model_kwargs: dict[str, Any] = {"n_threads": 1}
     if args.arm == "learned":
-        settings |= {"ensemble_max_error": args.max_error, "ensemble_pessimism": args.pessimism}
+        model_kwargs |= {"ensemble_max_error": args.max_error, "ensemble_pessimism": args.pessimism}
+    settings |= {"preset": "efficient", "forward_model": ARMS[args.arm], "model_kwargs": model_kwargs}
     return MCBSTD3("MlpPolicy", env, **settings)
 
 
@@ -70,7 +71,12 @@ def evaluate(agent: Any, env_id: str, models: list[str]) -> dict[str, list[float
     policies: dict[str, Any] = {"actor": agent}
     for model in models:
         policies[f"search, {model}"] = SearchPolicy(
-            agent, env, seed=EVALUATION_SEED, preset="efficient", n_threads=1, forward_model=model
+            agent,
+            env,
+            seed=EVALUATION_SEED,
+            preset="efficient",
+            model_kwargs=dict(n_threads=1),
+            forward_model=model,
         )
     returns: dict[str, Any] = {}
     for name, policy in policies.items():

@@ -23,9 +23,10 @@ from sb3_mcbs.search import PRESETS
 
 #: 18 simulated steps where every decision is searched.
 SEARCH = PRESETS["efficient"]
+#: The schedules, and what they need in ``schedule_kwargs``.
 SCHEDULES: dict[str, dict[str, Any]] = {
     "constant": {},
-    "saturation": {"search_schedule": "saturation", "final_search_share": 0.1},
+    "saturation": {"final_search_share": 0.1},
 }
 #: Environment steps, and what they are averaged over; both returns are flat long before the end.
 LENGTHS = {"Pendulum-v1": (25_000, 2_000), "InvertedDoublePendulum-v5": (50_000, 2_500)}
@@ -49,12 +50,12 @@ def train(env_id: str, schedule: str, seed: int) -> dict[str, Any]:
         gamma=0.98,
         action_noise=NormalActionNoise(np.zeros(1), np.full(1, 0.1)),
         policy_kwargs={"net_arch": [64, 64]},
-        n_threads=1,
+        model_kwargs=dict(n_threads=1),
         seed=seed,
         device="cpu",
-        saturation_window=window,
+        search_schedule=schedule,
+        schedule_kwargs={"saturation_window": window, **SCHEDULES[schedule]},
         **SEARCH,
-        **SCHEDULES[schedule],
     )
     start = time.perf_counter()
     agent.learn(steps)

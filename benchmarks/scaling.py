@@ -37,10 +37,11 @@ BASE = {"beam_width": 6, "rollout_depth": 3, "n_simulations": 5, "n_envs": 1, "n
 
 def searching(env_id: str, settings: dict[str, int]) -> MCBSTD3:
     """An agent in the middle of an episode."""
-    search = {name: value for name, value in settings.items() if name != "n_envs"}
+    search: dict[str, Any] = {**settings, "model_kwargs": {"n_threads": settings["n_threads"]}}
+    del search["n_envs"], search["n_threads"]
     env = make_vec_env(env_id, settings["n_envs"], seed=0)
     common: dict[str, Any] = {"policy_kwargs": NETWORKS, "seed": 0, "device": "cpu", "buffer_size": 1000}
-    agent = MCBSTD3("MlpPolicy", env, learning_starts=10**6, **common, **search)  # type: ignore[arg-type]
+    agent = MCBSTD3("MlpPolicy", env, learning_starts=10**6, **common, **search)
     agent.learn(50 * settings["n_envs"])
     return agent
 

@@ -10,7 +10,6 @@ simulated steps per decision), whatever it trained with. Results are written aft
 import argparse
 import json
 import time
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +24,12 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from benchmarks.common import NETWORKS, machine
 from benchmarks.search_training_arms import ARMS
-from sb3_mcbs import SearchPolicy, SearchSettings, SnapshotEnvWrapper
+from sb3_mcbs import SearchPolicy, SnapshotEnvWrapper
 
 EVALUATION_SEED = 1000
 EPISODES = 10
-#: Every setting has its value here, so that what an agent searches with in training has no part in it.
-EVALUATION_SEARCH = asdict(SearchSettings.preset("efficient", n_threads=1))
+#: With a preset, what an agent searches with in training has no part in it.
+EVALUATION_SEARCH: dict[str, Any] = {"preset": "efficient", "model_kwargs": {"n_threads": 1}}
 
 
 class Evaluation(BaseCallback):

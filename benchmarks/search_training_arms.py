@@ -12,28 +12,31 @@ ALGORITHM_1: dict[str, Any] = {
     "rollout_depth": 3,
     "n_simulations": 5,
     "beam_noise": 0.1,
-    "n_threads": 1,
+    "model_kwargs": {"n_threads": 1},
 }
 
 #: The search of the preset "efficient": 18 simulated steps per decision, no noise after the first action.
 EFFICIENT: dict[str, Any] = {
     **ALGORITHM_1,
     "n_simulations": 1,
-    "rollout_noise": 0.0,
-    "include_policy_action": True,
+    "search_kwargs": {"rollout_noise": 0.0, "include_policy_action": True},
 }
 HALF: dict[str, Any] = {"search_share": 0.5, "search_unit": "episode"}
 #: From all episodes to none.
 FADING: dict[str, Any] = {
     "search_schedule": "anneal",
-    "final_search_share": 0.0,
+    "schedule_kwargs": {"final_search_share": 0.0},
     "search_unit": "episode",
 }
 #: Targets of 3 steps, of which two are simulated, for half of every batch.
 EXPANSION: dict[str, Any] = {"value_expansion": 2}
 ON_TOP: dict[str, Any] = {"action_noise_after_search": True}
 #: Three times as many candidates at first.
-WIDE_EARLY: dict[str, Any] = {"beam_width": 18, "search_schedule": "anneal", "final_beam_width": 6}
+WIDE_EARLY: dict[str, Any] = {
+    "beam_width": 18,
+    "search_schedule": "anneal",
+    "schedule_kwargs": {"final_beam_width": 6},
+}
 
 ARMS: dict[str, tuple[type[TD3], dict[str, Any]]] = {
     "td3": (PlainTD3, {}),
@@ -43,7 +46,10 @@ ARMS: dict[str, tuple[type[TD3], dict[str, Any]]] = {
     "efficient": (MCBSTD3, EFFICIENT),
     "half": (MCBSTD3, EFFICIENT | HALF),
     "half_steps": (MCBSTD3, EFFICIENT | {"search_share": 0.5}),
-    "anneal": (MCBSTD3, EFFICIENT | {"search_schedule": "anneal", "final_search_share": 0.0}),
+    "anneal": (
+        MCBSTD3,
+        EFFICIENT | {"search_schedule": "anneal", "schedule_kwargs": {"final_search_share": 0.0}},
+    ),
     "anneal_episodes": (MCBSTD3, EFFICIENT | FADING),
     "half_noise": (MCBSTD3, EFFICIENT | HALF | ON_TOP),
     "half_n3": (MCBSTD3, EFFICIENT | HALF | {"n_steps": 3}),

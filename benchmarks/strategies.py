@@ -9,7 +9,7 @@ seeds and reported on another:
     python -m benchmarks.strategies --table
 
 The second runs what was best of each strategy and budget in the first, and the presets. Arms are named by
-their sizes: beam candidates x depth, tree width x branching x depth, refine width x rounds x depth; (2x3) is
+their sizes: beam candidates x depth, tree width x branching x depth, cem width x rounds x depth; (2x3) is
 a depth of 2 macro-steps of 3 steps, "in 2" two directions, "of 48" critic pre-selection. Arms that
 the file of results holds already are left out, but for ``--again``. The third runs a hundred episodes, for
 agents that fall in some: ten say little of them.
@@ -31,7 +31,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from benchmarks.common import known_path, parse_args, print_table, read, write, write_picture
 from benchmarks.strategies_arms import ARMS, BUDGETS, SLACK
 from sb3_mcbs import SearchPolicy, SearchSettings, SnapshotEnvWrapper, load_agent
-from sb3_mcbs.search import PRESETS
+from sb3_mcbs.search import PRESETS, make_settings
 
 FILE = "strategies"
 SEEDS = {"choosing": range(100, 102), "reporting": range(200, 210), "confirming": range(300, 400)}
@@ -41,7 +41,7 @@ CHOSEN_WITH = "sac-HalfCheetah-v3"
 
 def budget_of(arm: str) -> int | None:
     """The budget that an arm's simulated steps are about; ``None``: none of them."""
-    steps = SearchSettings(**ARMS[arm]).simulated_steps()
+    steps = make_settings(**ARMS[arm]).simulated_steps()
     near = [budget for budget in BUDGETS if abs(steps - budget) <= SLACK * budget]
     return near[0] if near else None
 
@@ -57,7 +57,7 @@ def run_arm(agent: OffPolicyAlgorithm, env_id: str, seeds: range, settings: dict
         ``realised`` the discounted return that followed, closed by the critics at a time limit.
     """
     env = make_vec_env(env_id, len(seeds), seed=seeds[0], wrapper_class=SnapshotEnvWrapper)
-    policy = SearchPolicy(agent, env, seed=seeds[0], **{"n_threads": 1, **settings})
+    policy = SearchPolicy(agent, env, seed=seeds[0], **{"model_kwargs": {"n_threads": 1}, **settings})
     planner, functions = policy.planner, policy.planner.functions()
     observations: Any = env.reset()
     running = list(range(len(seeds)))
@@ -132,13 +132,13 @@ def reported_arms(rows: list[dict[str, Any]]) -> list[str]:
     for arm in sorted(scores, key=lambda arm: scores[arm]):
         best[ARMS[arm].get("strategy", "beam"), budget_of(arm)] = arm
     presets = [SearchSettings.preset(name) for name in PRESETS]
-    wanted = {"actor alone", *best.values(), *(arm for arm in ARMS if SearchSettings(**ARMS[arm]) in presets)}
+    wanted = {"actor alone", *best.values(), *(arm for arm in ARMS if make_settings(**ARMS[arm]) in presets)}
     return [arm for arm in ARMS if arm in wanted]
 
 
 def by_cost(arms: list[str]) -> list[str]:
     """The cheapest first."""
-    return sorted(arms, key=lambda arm: SearchSettings(**ARMS[arm]).simulated_steps())
+    return sorted(arms, key=lambda arm: make_settings(**ARMS[arm]).simulated_steps())
 
 
 def ended_early(row: dict[str, Any]) -> int:
@@ -180,7 +180,7 @@ def draw(rows: list[dict[str, Any]]) -> None:
         of_agent = [row for row in rows if row["agent"] == agent and row["seeds"] != "confirming"]
         actor = [np.mean(row["returns"]) for row in of_agent if row["arm"] == "actor alone"][-1]
         panel.axhline(actor, color="grey", linestyle=":", label="actor alone")
-        for strategy, marker, color in (("beam", "o", "C0"), ("tree", "^", "C1"), ("refine", "s", "C2")):
+        for strategy, marker, color in (("beam", "o", "C0"), ("tree", "^", "C1"), ("cem", "s", "C2")):
             for seeds, filled in (("choosing", False), ("reporting", True)):
                 points = [
                     (row["simulated steps"], np.mean(row["returns"]))
@@ -219,7 +219,7 @@ def run_arms(agent: OffPolicyAlgorithm, name: str, arms: list[str], arguments: a
         row = {**of, "settings": settings}
         if not arguments.again and any(row.items() <= other.items() for other in read(FILE)):
             known.append(arm)
-        elif SearchSettings(**settings).simulated_steps() > arguments.most:
+        elif make_settings(**settings).simulated_steps() > arguments.most:
             costly.append(arm)
         else:
             result = run_arm(agent, arguments.env, SEEDS[arguments.seeds], settings)

@@ -107,8 +107,10 @@ def main() -> None:
         "rollout_depth": args.rollout_depth,
         "n_simulations": args.n_simulations,
         "beam_noise": args.beam_noise,
-        "rollout_noise": args.rollout_noise,
-        "include_policy_action": args.include_policy_action,
+        "search_kwargs": {
+            "rollout_noise": args.rollout_noise,
+            "include_policy_action": args.include_policy_action,
+        },
     }
     searching = SearchPolicy(agent, env, seed=0, **settings)
     seeds = range(args.episodes)

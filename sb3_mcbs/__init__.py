@@ -7,7 +7,7 @@ from sb3_mcbs.agents.faults import NonFiniteError
 from sb3_mcbs.checkpoints import CheckpointError, ExactCheckpointCallback, resume
 from sb3_mcbs.loading import AgentFileError, load_agent, load_statistics, save_statistics
 from sb3_mcbs.models import WorkerError
-from sb3_mcbs.search import SearchSettings
+from sb3_mcbs.search import BeamSettings, CEMSettings, SearchSettings, TreeSettings
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 
 try:
@@ -22,12 +22,15 @@ __all__ = [
     "MCBSTD3",
     "MCBSTQC",
     "AgentFileError",
+    "BeamSettings",
+    "CEMSettings",
     "CheckpointError",
     "ExactCheckpointCallback",
     "NonFiniteError",
     "SearchPolicy",
     "SearchSettings",
     "SnapshotEnvWrapper",
+    "TreeSettings",
     "WorkerError",
     "__version__",
     "load_agent",

@@ -22,7 +22,7 @@ from sb3_mcbs.snapshot import registry, verification
 th.set_num_threads(1)
 
 SMALL = dict(policy_kwargs=dict(net_arch=[16, 16]), buffer_size=2000, batch_size=16, device="cpu")
-SMALL_SEARCH = dict(beam_width=3, rollout_depth=2, n_simulations=2, n_threads=1)
+SMALL_SEARCH = dict(beam_width=3, rollout_depth=2, n_simulations=2, model_kwargs=dict(n_threads=1))
 #: Every algorithm that searches, and what it is without.
 WITHOUT_SEARCH: dict[type[MCBS], type[OffPolicyAlgorithm]] = {
     MCBSTD3: TD3,
@@ -61,6 +61,8 @@ def make_agent() -> Callable[..., MCBS]:
 
     def make(env="Pendulum-v1", policy: str = "MlpPolicy", cls: type = MCBSTD3, **settings) -> MCBS:
         search = SMALL_SEARCH if issubclass(cls, MCBS) else {}
+        if search and "model_kwargs" in settings:
+            settings["model_kwargs"] = {**search["model_kwargs"], **settings["model_kwargs"]}
         # SAC writes into the policy_kwargs that it is given.
         return cls(policy, env, **{"seed": 0, "learning_starts": 20, **deepcopy(SMALL), **search, **settings})
 

@@ -218,8 +218,8 @@ class ReferenceTree:
         return [ranking[place] for place in sorted(places[: self.width])]
 
 
-class ReferenceRefine:
-    """Cross-entropy refinement of plans in one environment.
+class ReferenceCEM:
+    """The cross-entropy method in one environment.
 
     :param reference: the simulator and the agent
     :param width: plans per round

@@ -7,14 +7,20 @@ from typing import get_type_hints
 import pytest
 
 from sb3_mcbs import MCBS, MCBSSAC
-from sb3_mcbs.agents.hyperparameters import SearchKeywords, setting_fields
+from sb3_mcbs.agents import EnsembleSettings, ScheduleSettings
+from sb3_mcbs.agents.hyperparameters import SETTINGS
+from sb3_mcbs.agents.value_expansion import ValueExpansionSettings
 from sb3_mcbs.networks.td3_update import FastUpdate
+from sb3_mcbs.search.settings import STRATEGIES
 from tests.conftest import SEARCHING, SMALL_SEARCH, WITHOUT_SEARCH
 
+#: What a preset may say: ``None`` in signatures.
+OF_PRESETS = {"beam_width", "rollout_depth", "n_simulations", "beam_noise", "strategy"}
 
-def own_settings(cls) -> set[str]:
-    """The keyword-only parameters that are not fields of SearchSettings."""
-    return {"action_noise_after_search", "preset", *(["fast_update"] if issubclass(cls, FastUpdate) else [])}
+
+def keywords(cls) -> list[str]:
+    """The parameters that are not SB3's."""
+    return [*SETTINGS, *(["fast_update"] if issubclass(cls, FastUpdate) else [])]
 
 
 @pytest.mark.parametrize("cls", SEARCHING)
@@ -26,26 +32,48 @@ def test_parameters_are_sb3s_in_their_order_and_then_the_searchs(cls):
         assert (ours[name].default, ours[name].kind) == (parameter.default, parameter.kind), name
     others = {name: ours[name] for name in list(ours)[len(theirs) :]}
     assert {parameter.kind for parameter in others.values()} == {inspect.Parameter.KEYWORD_ONLY}
-    search = {field.name: field.default for field in setting_fields()}
-    assert others.keys() == search.keys() | own_settings(cls)
-    assert {name: others[name].default for name in search} == search
+    assert list(others) == keywords(cls)
+    defaults = {name: None if name in OF_PRESETS else default for name, default in SETTINGS.items()}
+    assert {name: others[name].default for name in SETTINGS} == defaults
     assert inspect.signature(cls).parameters.keys() == ours.keys() - {"self"}
+
+
+def test_defaults_are_those_of_the_settings():
+    beam, known = STRATEGIES["beam"](), {"action_noise_after_search": False, "preset": None}
+    for settings in (beam, ScheduleSettings(), ValueExpansionSettings()):
+        known |= settings.grouped()
+    assert known == SETTINGS
 
 
 @pytest.mark.parametrize("cls", SEARCHING)
 def test_every_parameter_is_documented_once_and_kept(make_agent, cls):
+    ours, theirs = (
+        re.findall(r"^:param (\w+):", inspect.cleandoc(each.__doc__), re.MULTILINE)
+        for each in (cls, WITHOUT_SEARCH[cls])
+    )
     parameters = list(inspect.signature(cls).parameters)
-    assert re.findall(r"^:param (\w+):", inspect.cleandoc(cls.__doc__), re.MULTILINE) == parameters
+    assert ours == [name for name in parameters if name in ours], "each once, in their order"
+    assert set(parameters) == {*ours, *theirs}, "what is as SB3 says is documented there"
+    assert set(keywords(cls)) <= set(ours)
     agent = make_agent(cls=cls)
-    for name in {*(field.name for field in setting_fields()), *own_settings(cls)}:
+    for name in keywords(cls):
         assert hasattr(agent, name), name
     assert {name: getattr(agent, name) for name in SMALL_SEARCH} == SMALL_SEARCH
 
 
+def test_every_key_is_documented_where_the_agents_point_to():
+    for cls in (*STRATEGIES.values(), ScheduleSettings, EnsembleSettings):
+        documents = "".join(base.__doc__ or "" for base in cls.__mro__[:2])
+        assert cls.in_group()
+        for key in cls.in_group():
+            assert documents.count(f":param {key}:") == 1, key
+
+
 def test_type_checkers_know_every_setting():
-    types = {field.name: field.type for field in setting_fields()}
-    assert get_type_hints(SearchKeywords) == types
-    assert {name: hint for name, hint in get_type_hints(MCBS).items() if name in types} == types
+    attributes, parameters = get_type_hints(MCBS), inspect.signature(MCBSSAC).parameters
+    for name in SETTINGS:
+        kept = attributes[name] | None if name in OF_PRESETS else attributes[name]
+        assert kept == parameters[name].annotation, name
 
 
 def test_subclasses_of_users_are_left_alone():

@@ -13,31 +13,49 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_mcbs import MCBSSAC, MCBSTD3, MCBSTQC, SearchPolicy
+from sb3_mcbs.agents.hyperparameters import SETTINGS
 from sb3_mcbs.agents.schedule import ScheduleSettings
-from sb3_mcbs.search import PRESETS, SearchSettings
+from sb3_mcbs.search import PRESETS, CEMSettings, SearchSettings, TreeSettings
 from tests.checkpoint_helpers import assert_resumed_is_exact
 from tests.conftest import SEARCHING, SMALL, SMALL_SEARCH, assert_same_parameters, snapshot_vec_env
 
 CHANGES = [
     (MCBSTD3, dict(beam_width=5)),
     (MCBSTD3, dict(rollout_depth=0)),
-    (MCBSTD3, dict(rollout_depth=3, n_simulations=1, beam_noise=0.3, rollout_noise=0.0, noise_clip=0.4)),
-    (MCBSTD3, dict(strategy="refine", rollout_depth=3)),
-    (MCBSTD3, dict(strategy="tree", branching=2)),
-    (MCBSTD3, dict(include_policy_action=True, antithetic=True)),
-    (MCBSTD3, dict(n_threads=2, forward_model="pool", matmul_precision="high")),
-    (MCBSTD3, dict(proposal_dims=1, n_proposals=6, noise_hold=2)),
+    (
+        MCBSTD3,
+        dict(
+            rollout_depth=3,
+            n_simulations=1,
+            beam_noise=0.3,
+            search_kwargs=dict(rollout_noise=0.0, noise_clip=0.4),
+        ),
+    ),
+    (MCBSTD3, dict(strategy="cem", rollout_depth=3)),
+    (MCBSTD3, dict(strategy="tree", search_kwargs=dict(branching=2))),
+    (MCBSTD3, dict(search_kwargs=dict(include_policy_action=True, antithetic=True))),
+    (MCBSTD3, dict(model_kwargs=dict(n_threads=2), forward_model="pool", matmul_precision="high")),
+    (MCBSTD3, dict(search_kwargs=dict(proposal_dims=1, n_proposals=6, noise_hold=2))),
     (MCBSTD3, dict(search_share=0.5, search_unit="episode")),
-    (MCBSTD3, dict(search_schedule="saturation", final_search_share=0.1, saturation_window=20)),
-    (MCBSTD3, dict(search_schedule="anneal", final_beam_width=1, final_rollout_depth=1)),
-    (MCBSSAC, dict(strategy="tree", branching=2)),
+    (
+        MCBSTD3,
+        dict(
+            search_schedule="saturation", schedule_kwargs=dict(final_search_share=0.1, saturation_window=20)
+        ),
+    ),
+    (
+        MCBSTD3,
+        dict(search_schedule="anneal", schedule_kwargs=dict(final_beam_width=1, final_rollout_depth=1)),
+    ),
+    (MCBSSAC, dict(strategy="tree", search_kwargs=dict(branching=2))),
     (MCBSTQC, dict(beam_width=5)),
 ]
 
 
 def change(agent, changes: dict) -> None:
     if "search_schedule" in changes:  # which has no meaning without the others, nor they without it
-        agent.schedule_settings = ScheduleSettings(**changes)
+        own = changes["schedule_kwargs"]
+        agent.schedule_settings = ScheduleSettings(search_schedule=changes["search_schedule"], **own)
         return
     for name, value in changes.items():
         setattr(agent, name, value)
@@ -90,7 +108,7 @@ def test_a_callback_may_change_settings_while_training(make_agent, cls, changes)
     untouched = trained(make_agent(cls=cls))
     rows = [each.replay_buffer.actions[:60] for each in (agent, untouched)]
     np.testing.assert_array_equal(rows[0][:40], rows[1][:40])
-    assert np.array_equal(*rows) == ("n_threads" in changes)
+    assert np.array_equal(*rows) == ("model_kwargs" in changes)
 
 
 def test_a_changed_width_holds_from_the_next_decision_on(make_agent):
@@ -119,17 +137,21 @@ def test_wrong_values_are_refused_at_once_and_change_nothing(make_agent, cls):
         ("beam_width", 2.5, TypeError, "beam_width must be an integer"),
         ("beam_noise", 0.0, ValueError, "beam_width above 1 needs a beam_noise above 0"),
         ("beam_noise", float("nan"), ValueError, "beam_noise must be finite"),
-        ("max_beam_width", 9, ValueError, "max_beam_width needs a time_budget"),
-        ("proposal_dims", 2, ValueError, "proposal_dims must be at most 1"),
+        ("search_kwargs", {"max_beam_width": 9}, ValueError, "max_beam_width needs a time_budget"),
+        ("search_kwargs", {"proposal_dims": 2}, ValueError, "proposal_dims must be at most 1"),
+        ("search_kwargs", {"branching": 2}, TypeError, "branching is for strategy='tree'"),
+        ("search_kwargs", ["antithetic"], TypeError, "search_kwargs must be a dictionary or None"),
         ("search_share", 1.5, ValueError, "search_share must be finite"),
-        ("final_search_share", 0.5, ValueError, "final_search_share has no meaning"),
+        ("schedule_kwargs", {"final_search_share": 0.5}, ValueError, "final_search_share has no meaning"),
+        ("schedule_kwargs", {"window": 5}, TypeError, "search_schedule='constant' has no 'window'"),
         ("action_noise_after_search", "yes", TypeError, "action_noise_after_search"),
         ("preset", "quick", ValueError, "There is no preset 'quick'"),
         ("value_expansion", 2, ValueError, "not from or to 0"),
         ("forward_model", "ensemble", ValueError, "decided when it is made or loaded"),
         ("forward_model", "mujoco", Exception, "environment 0"),
-        ("ensemble_size", 1, ValueError, "ensemble_size must be between 2"),
-        ("search_settings", {"beam_width": 3}, TypeError, "Expected SearchSettings"),
+        ("model_kwargs", {"ensemble_size": 3}, TypeError, "ensemble_size is for forward_model='ensemble'"),
+        ("model_kwargs", {"n_threads": -1}, ValueError, "n_threads must be between 0"),
+        ("search_settings", {"beam_width": 3}, TypeError, "Expected BeamSettings"),
     ):
         with pytest.raises(error, match=match):
             setattr(agent, name, value)
@@ -147,21 +169,24 @@ def test_what_is_kept_beside_the_replay_buffer_stays_as_it_is(make_agent):
 
 
 def test_all_settings_change_at_once(make_agent):
-    agent = make_agent(beam_width=1, beam_noise=0.0, rollout_noise=0.1, search_share=0.5)
+    agent = make_agent(beam_width=1, beam_noise=0.0, search_kwargs=dict(rollout_noise=0.1), search_share=0.5)
     with pytest.raises(ValueError, match="beam_noise above 0"):
-        agent.strategy = "refine"
-    agent.search_settings = replace(agent.search_settings, strategy="refine", beam_width=4, beam_noise=0.1)
+        agent.strategy = "cem"
+    agent.search_settings = CEMSettings(beam_width=4, rollout_depth=2, n_simulations=2, n_threads=1)
     agent.schedule_settings = ScheduleSettings(search_share=0.25)
-    assert (agent.strategy, agent.beam_width, agent.search_share) == ("refine", 4, 0.25)
+    assert (agent.strategy, agent.beam_width, agent.search_share) == ("cem", 4, 0.25)
     agent.learn(60)
     assert 0 < agent.n_decisions < 40
 
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_a_preset_can_be_set_later_and_when_loading(tmp_path, preset):
-    expected, before = SearchSettings.preset(preset, n_threads=1), "paper" if preset == "strong" else "strong"
+    expected = SearchSettings.preset(preset, model_kwargs=dict(n_threads=1))
+    before = "paper" if preset == "strong" else "strong"
     env = snapshot_vec_env("Pendulum-v1")
-    agent = MCBSTD3("MlpPolicy", env, preset=before, search_share=0.5, n_threads=1, **SMALL)
+    agent = MCBSTD3(
+        "MlpPolicy", env, preset=before, search_share=0.5, model_kwargs=dict(n_threads=1), **SMALL
+    )
     agent.save(tmp_path / "agent")
     agent.preset = preset
     loaded = MCBSTD3.load(tmp_path / "agent", snapshot_vec_env("Pendulum-v1"), device="cpu", preset=preset)
@@ -193,7 +218,15 @@ def test_where_the_schedule_starts_to_leave_the_search_out_the_actor_explores(ma
     assert agent.n_decisions == 10 and 0.02 < noise.std() < 0.3
 
 
-@pytest.mark.parametrize("changes", [dict(beam_width=5), dict(strategy="refine"), dict(search_share=0.3)])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        dict(beam_width=5),
+        dict(strategy="cem"),
+        dict(search_kwargs=dict(antithetic=True)),
+        dict(search_share=0.3),
+    ],
+)
 def test_a_resumed_run_goes_on_with_the_changed_settings(tmp_path, changes):
     def make(folder):
         env = snapshot_vec_env("Pendulum-v1")
@@ -206,6 +239,45 @@ def test_a_resumed_run_goes_on_with_the_changed_settings(tmp_path, changes):
     for agent in agents:
         assert {name: getattr(agent, name) for name in changes} == changes
         assert agent.planner.settings == agent.search_settings
+
+
+def test_what_is_changed_within_a_dictionary_holds_from_the_next_decision_on(make_agent, tmp_path):
+    given = dict(noise_clip=0.5)
+    agent = make_agent(search_kwargs=given).learn(30)
+    given["noise_clip"] = 0.1
+    assert agent.search_settings.noise_clip == 0.5, "it is the caller's own"
+    agent.search_kwargs["noise_clip"] = 0.2
+    agent.learn(10, reset_num_timesteps=False)
+    assert agent.planner.settings.noise_clip == 0.2
+    agent.save(tmp_path / "agent")
+    assert MCBSTD3.load(tmp_path / "agent").search_kwargs == {"noise_clip": 0.2}
+    other = copy.copy(agent)
+    other.search_kwargs["branching"] = 2
+    with pytest.raises(TypeError, match="branching is for strategy='tree'"):
+        other.learn(10)
+    agent.learn(30)
+    policy = SearchPolicy(agent, agent.get_env(), seed=0)
+    with pytest.raises(TypeError, match="does not support item assignment"):
+        policy.search_kwargs["noise_clip"] = 0.3
+    policy.search_kwargs = {**policy.search_kwargs, "antithetic": True}
+    assert (policy.settings.noise_clip, policy.settings.antithetic) == (0.2, True)
+
+
+def test_what_was_taken_from_a_preset_does_not_come_back(tmp_path):
+    """An agent is made again from its attributes, the preset among them."""
+    for changes in ({"search_kwargs": None}, {"search_kwargs": {"n_rounds": 2}}, {"strategy": "tree"}):
+        agent = MCBSTD3("MlpPolicy", "Pendulum-v1", preset="strong", strategy="beam", **SMALL)
+        agent.preset = "strong"
+        if "strategy" in changes:
+            agent.search_kwargs = {"antithetic": True}
+        for name, value in changes.items():
+            setattr(agent, name, value)
+        again = {name: getattr(agent, name) for name in SETTINGS}
+        assert agent.preset is None
+        assert MCBSTD3("MlpPolicy", "Pendulum-v1", **again, **SMALL).search_settings == agent.search_settings
+    agent = MCBSTD3("MlpPolicy", "Pendulum-v1", preset="strong", **SMALL)
+    agent.beam_width, agent.search_kwargs = 8, {**agent.search_kwargs, "n_rounds": 2}
+    assert agent.preset == "strong" and agent.search_settings.n_elites == 4
 
 
 def test_settings_of_a_search_policy_are_attributes(make_agent):
@@ -223,11 +295,12 @@ def test_settings_of_a_search_policy_are_attributes(make_agent):
     assert (policy.beam_width, agent.beam_width, simulated()) == (5, 3, 5 + 2 * 5)
     policy.rollout_depth = 0
     assert simulated() == 0
-    policy.settings = SearchSettings(strategy="tree", beam_width=2, branching=3, rollout_depth=2, n_threads=1)
+    policy.settings = TreeSettings(beam_width=2, branching=3, rollout_depth=2, n_threads=1)
     assert simulated() == policy.settings.simulated_steps() == 12
     policy.preset = "efficient"
-    assert policy.settings == SearchSettings.preset("efficient", n_threads=1) and simulated() == 18
-    expected = SearchPolicy(agent, env, seed=1, preset="efficient", n_threads=1)
+    assert policy.settings == SearchSettings.preset("efficient", model_kwargs=dict(n_threads=1))
+    assert simulated() == 18
+    expected = SearchPolicy(agent, env, seed=1, preset="efficient", model_kwargs=dict(n_threads=1))
     policy.rng = np.random.default_rng(1)
     np.testing.assert_array_equal(policy.predict(observation)[0], expected.predict(observation)[0])
 
@@ -238,9 +311,10 @@ def test_what_a_search_policy_does_not_follow_is_refused(make_agent):
     before = policy.settings
     for name, value, error, match in (
         ("strategy", "nonsense", ValueError, "strategy must be one of"),
-        ("proposal_dims", 2, ValueError, "proposal_dims must be at most 1"),
+        ("search_kwargs", {"proposal_dims": 2}, ValueError, "proposal_dims must be at most 1"),
+        ("model_kwargs", {"ensemble_size": 3}, TypeError, "has no 'ensemble_size'"),
         ("forward_model", "mujoco", Exception, "environment 0"),
-        ("settings", {"beam_width": 3}, TypeError, "Expected SearchSettings"),
+        ("settings", {"beam_width": 3}, TypeError, "Expected BeamSettings"),
         ("preset", "quick", ValueError, "There is no preset 'quick'"),
         ("vec_env", other.get_env(), AttributeError, "vec_env of a SearchPolicy cannot be exchanged"),
         ("model", other, AttributeError, "model of a SearchPolicy cannot be exchanged"),
@@ -292,7 +366,7 @@ def test_rewards_are_scaled_as_the_critics_learn_them(make_agent):
 def test_what_was_noticed_of_the_environment_is_not_forgotten(make_agent):
     agent = make_agent().learn(25)
     agent.planner.model.deterministic = False
-    agent.n_threads = 2
+    agent.model_kwargs = dict(n_threads=2)
     assert not agent.planner.model.deterministic
     agent.beam_width = 4
     assert not agent.planner.model.deterministic
@@ -314,7 +388,7 @@ def test_an_environment_that_cannot_be_searched_in_leaves_the_old_one(make_agent
 
 
 def test_a_copy_without_environments_takes_settings(make_agent):
-    agent = make_agent(VecNormalize(make_vec_env("Pendulum-v1", 1, seed=0)), strategy="refine").learn(30)
+    agent = make_agent(VecNormalize(make_vec_env("Pendulum-v1", 1, seed=0)), strategy="cem").learn(30)
     other = copy.deepcopy(agent)
     other.beam_width, other.rollout_depth, other.search_share = 7, 3, 0.5
     other.set_env(VecNormalize(make_vec_env("Pendulum-v1", 1, seed=0)))
@@ -331,7 +405,7 @@ def test_value_expansion_refuses_another_simulator_at_once(make_agent):
 def test_a_preset_among_custom_objects(make_agent, tmp_path):
     make_agent().save(tmp_path / "agent")
     loaded = MCBSTD3.load(tmp_path / "agent", device="cpu", custom_objects={"preset": "strong"})
-    assert loaded.search_settings == SearchSettings.preset("strong", n_threads=1)
+    assert loaded.search_settings == SearchSettings.preset("strong", model_kwargs=dict(n_threads=1))
 
 
 def test_a_search_policy_says_what_is_not_its_own(make_agent):

@@ -32,7 +32,7 @@ from sb3_mcbs.checkpoints import CheckpointError
 from tests.checkpoint_helpers import Crash, assert_resumed_is_exact, assert_same_runs, crash, learn
 
 SMALL = dict(learning_starts=20, batch_size=16, seed=0, device="cpu")
-SEARCH = dict(beam_width=3, rollout_depth=2, n_simulations=2, n_threads=1)
+SEARCH = dict(beam_width=3, rollout_depth=2, n_simulations=2, model_kwargs=dict(n_threads=1))
 
 
 def maker(cls, env_id="Pendulum-v1", n_envs=1, vec_env_cls=None, wrap=lambda vec_env: vec_env, **settings):
@@ -81,11 +81,11 @@ RUNS = {
         search_schedule="saturation",
         search_unit="episode",
         search_share=0.6,
-        saturation_window=20,
+        schedule_kwargs=dict(saturation_window=20),
     ),
-    "MCBSTD3, few directions": maker(MCBSTD3, "Hopper-v5", proposal_dims=2, noise_hold=2),
+    "MCBSTD3, few directions": maker(MCBSTD3, "Hopper-v5", search_kwargs=dict(proposal_dims=2, noise_hold=2)),
     "MCBSDDPG": maker(MCBSDDPG),
-    "MCBSDDPG, refinement of a preset": maker(MCBSDDPG, preset="balanced"),
+    "MCBSDDPG, plans of a preset": maker(MCBSDDPG, preset="balanced"),
     "MCBSSAC": maker(MCBSSAC),
     "MCBSSAC, gSDE": maker(MCBSSAC, use_sde=True, use_sde_at_warmup=True),
     "MCBSTQC": maker(MCBSTQC),
@@ -260,11 +260,15 @@ def test_settings_are_those_of_the_run(tmp_path):
 
 @pytest.mark.parametrize("cls", [MCBSTD3, MCBSDDPG, MCBSSAC, MCBSTQC])
 def test_settings_that_override_a_preset_are_those_of_the_run(cls, tmp_path):
-    make = maker(cls, preset="strong", strategy="beam", rollout_noise=0.2, n_elites=None)
+    make = maker(cls, preset="strong", beam_width=7, search_kwargs=dict(rollout_noise=0.2, n_elites=None))
     crash(make, tmp_path, 60, 45)
     agent = resume(tmp_path / "checkpoints")
     assert agent.search_settings == make(tmp_path / "other").search_settings
-    assert (agent.preset, agent.n_rounds, agent.strategy, agent.beam_width) == ("strong", 4, "beam", 3)
+    assert (agent.preset, agent.strategy, agent.beam_width) == ("strong", "cem", 7)
+    own = dict(n_rounds=4, n_elites=None, antithetic=True, rollout_noise=0.2)
+    assert agent.search_kwargs == own
+    other = maker(cls, preset="strong", strategy="beam")(tmp_path / "beam")
+    assert (other.strategy, other.search_kwargs) == ("beam", dict(antithetic=True))
 
 
 def test_learn_may_be_called_again(tmp_path):

@@ -64,8 +64,8 @@ HANDLERS = {
     "efficient": dict(preset="efficient"),
     "value expansion": dict(env="Hopper-v5", value_expansion=2),
     "value expansion of SAC": dict(env="Hopper-v5", value_expansion=2, cls=MCBSSAC),
-    "plans": dict(strategy="refine", n_rounds=2),
-    "directions": dict(env="HalfCheetah-v5", proposal_dims=2),
+    "plans": dict(strategy="cem", search_kwargs=dict(n_rounds=2)),
+    "directions": dict(env="HalfCheetah-v5", search_kwargs=dict(proposal_dims=2)),
     "no simulation": dict(rollout_depth=0),
     "half of the steps": dict(search_share=0.5),
 }
@@ -85,8 +85,9 @@ def test_every_kind_of_search_goes_on(make_agent, kind):
 @pytest.mark.usefixtures("small_ensembles")
 @every_way
 def test_a_learned_model_goes_on(make_agent, make_copy):
-    settings = dict(forward_model="ensemble", ensemble_size=2, ensemble_train_freq=50)
-    original = make_agent(**settings, ensemble_gradient_steps=20, ensemble_max_error=100.0).learn(150)
+    learned = dict(ensemble_size=2, ensemble_train_freq=50)
+    learned |= dict(ensemble_gradient_steps=20, ensemble_max_error=100.0)
+    original = make_agent(forward_model="ensemble", model_kwargs=learned).learn(150)
     other = make_copy(original)
     assert_same_future(original, other, 60)
     assert other.planner.model.ensemble is other.learned_model.ensemble
@@ -125,7 +126,9 @@ def search_around(policy, action: float) -> None:
 @every_way
 def test_a_copy_of_a_search_policy_acts_with_its_own_networks_and_environments(make_agent, make_copy):
     agent = make_agent(cls=TD3)
-    original = SearchPolicy(agent, snapshot_vec_env("Pendulum-v1"), seed=0, strategy="refine", n_rounds=2)
+    original = SearchPolicy(
+        agent, snapshot_vec_env("Pendulum-v1"), seed=0, strategy="cem", search_kwargs=dict(n_rounds=2)
+    )
     observations = original.vec_env.reset()
     for _ in range(3):
         observations = original.vec_env.step(original.predict(observations)[0])[0]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sb3_mcbs import MCBSTD3, SearchPolicy, SearchSettings
+from sb3_mcbs import MCBSTD3, BeamSettings, SearchPolicy
 from sb3_mcbs.search import LatencyForecast, PolicyFunctions, Roots, beam_search, deadline_search
 from sb3_mcbs.search.beam import Noise
 from tests.conftest import snapshot_vec_env
@@ -43,7 +43,7 @@ AGENT = PolicyFunctions(
 
 
 def settings(**changes):
-    return SearchSettings(
+    return BeamSettings(
         **{**dict(beam_width=8, rollout_depth=1, n_simulations=1, time_budget=1.0), **changes}
     )
 
@@ -82,7 +82,7 @@ def test_the_best_of_all_rounds_is_chosen_and_matches_one_beam():
     one_beam = beam_search(
         Roots(LineWorld(), roots, np.array(roots)[:, None]),
         AGENT,
-        SearchSettings(8, 1, 1),
+        BeamSettings(8, 1, 1),
         noise,
         np.random.default_rng(0),
     )
@@ -181,12 +181,12 @@ def test_settings_are_checked():
 
 
 def test_an_agent_trains_and_acts_with_a_budget(make_agent, tmp_path):
-    agent = make_agent(time_budget=30.0, max_beam_width=12)
+    agent = make_agent(search_kwargs=dict(time_budget=30.0, max_beam_width=12))
     agent.learn(60)
     assert agent.n_decisions == 40 and agent.n_simulated_steps > 0
     agent.save(tmp_path / "agent")
     loaded = MCBSTD3.load(tmp_path / "agent", device="cpu")
-    assert loaded.time_budget == 30.0 and loaded.max_beam_width == 12
+    assert loaded.search_kwargs == dict(time_budget=30.0, max_beam_width=12)
     env = snapshot_vec_env("Pendulum-v1")
     policy = SearchPolicy(loaded, env, seed=0)
     observations = env.reset()
@@ -207,7 +207,11 @@ def test_the_critics_answers_are_counted():
 
 def test_searches_of_some_environments_do_not_spoil_the_forecasts_of_all():
     agent = MCBSTD3(
-        "MlpPolicy", snapshot_vec_env("HalfCheetah-v5", 3), time_budget=0.05, seed=0, device="cpu"
+        "MlpPolicy",
+        snapshot_vec_env("HalfCheetah-v5", 3),
+        search_kwargs=dict(time_budget=0.05),
+        seed=0,
+        device="cpu",
     )
     agent._setup_learn(1)
     planner = agent.planner

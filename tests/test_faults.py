@@ -360,7 +360,9 @@ def test_large_numbers_are_finite(make_agent) -> None:
 
 
 @pytest.mark.parametrize("network", ["actor", "critic"])
-@pytest.mark.parametrize("settings", [{}, {"rollout_depth": 0}, {"time_budget": 1.0, "max_beam_width": 4}])
+@pytest.mark.parametrize(
+    "settings", [{}, {"rollout_depth": 0}, {"search_kwargs": {"time_budget": 1.0, "max_beam_width": 4}}]
+)
 def test_networks_that_diverged(make_agent, network: str, settings: dict) -> None:
     agent = make_agent("InvertedPendulum-v5", **settings)
     agent.learn(25)
@@ -477,7 +479,7 @@ def arm(wrapper: SnapshotEnvWrapper) -> None:
 
 
 @pytest.mark.parametrize(("vec_env_cls", "n_envs"), [(DummyVecEnv, 1), (DummyVecEnv, 2), (SubprocVecEnv, 2)])
-@pytest.mark.parametrize("strategy", ["beam", "tree", "refine"])
+@pytest.mark.parametrize("strategy", ["beam", "tree", "cem"])
 def test_all_simulations_invalid_is_no_quiet_state(make_agent, caplog, vec_env_cls, n_envs, strategy) -> None:
     if vec_env_cls is SubprocVecEnv and strategy != "beam":
         pytest.skip("workers do the same for every strategy")

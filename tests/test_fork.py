@@ -20,7 +20,7 @@ more = dict(vec_env_cls=SubprocVecEnv, vec_env_kwargs=dict(start_method="fork"))
 env = make_vec_env(env_id, 2, seed=0, wrapper_class=SnapshotEnvWrapper, **more)
 agent = MCBSTD3(
     "MlpPolicy", env, learning_starts=20, device="cpu", batch_size=256, buffer_size=500, seed=0,
-    beam_width=4, rollout_depth=2, n_threads=2, **search,
+    beam_width=4, rollout_depth=2, model_kwargs=dict(n_threads=2), **search,
 )
 agent.learn(60)
 policy = SearchPolicy(agent, env, seed=0)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sb3_mcbs import MCBSTD3, SearchPolicy, SearchSettings
+from sb3_mcbs import MCBSTD3, BeamSettings, CEMSettings, SearchPolicy, TreeSettings
 from sb3_mcbs.agents.planner import Planner
 from sb3_mcbs.search import (
     RecentActions,
@@ -12,17 +12,18 @@ from sb3_mcbs.search import (
     beam_search,
     deadline_search,
     draw_noise,
+    make_settings,
     search,
 )
+from sb3_mcbs.search.cem import cem_search, draw_plan_noise, first_spread
 from sb3_mcbs.search.deadline import LatencyForecast
 from sb3_mcbs.search.directions import ENOUGH, RECENT, low_dimensional
-from sb3_mcbs.search.refine import draw_plan_noise, first_spread, refine_search
 from sb3_mcbs.search.tree import draw_tree_noise, tree_search
 from tests import reference_strategies
 from tests.checkpoint_helpers import assert_resumed_is_exact
 from tests.conftest import SMALL, snapshot_vec_env
 from tests.fake_model import LineWorld
-from tests.reference_strategies import ReferenceBeam, ReferenceRefine, ReferenceTree
+from tests.reference_strategies import ReferenceBeam, ReferenceCEM, ReferenceTree
 from tests.test_reference import reference_for, walk
 from tests.test_search import AGENT
 from tests.test_strategies import ROOTS, WORLDS, assert_agree, identify, line_reference
@@ -40,7 +41,7 @@ TREES = [
     dict(beam_width=2, branching=3, rollout_depth=2, noise_hold=4, include_policy_action=True),
     dict(beam_width=3, branching=2, rollout_depth=3, noise_hold=2, n_proposals=15),
 ]
-REFINEMENTS = [
+PLANS = [
     dict(beam_width=4, n_rounds=3, rollout_depth=2, noise_hold=2, n_elites=2),
     dict(
         beam_width=5, n_rounds=2, rollout_depth=1, noise_hold=4, include_policy_action=True, antithetic=True
@@ -55,17 +56,17 @@ def tree_of(reference, settings) -> ReferenceTree:
     return ReferenceTree(reference, *sizes, settings.noise_hold)
 
 
-def refinement_of(reference, settings, directions=None) -> ReferenceRefine:
+def cem_of(reference, settings, directions=None) -> ReferenceCEM:
     spreads = first_spread(settings)[:, 0].tolist()
     sizes = settings.beam_width, settings.effective_n_elites, spreads, settings.min_noise
-    return ReferenceRefine(reference, *sizes, settings.include_policy_action, settings.noise_hold, directions)
+    return ReferenceCEM(reference, *sizes, settings.include_policy_action, settings.noise_hold, directions)
 
 
 @worlds
 @pytest.mark.parametrize("changes", BEAMS, ids=identify)
 @pytest.mark.parametrize("deterministic", [True, False], ids=["deterministic", "random"])
 def test_a_beam_that_holds_noise_equals_the_reference(changes, world, deterministic):
-    settings, model = SearchSettings(**{"beam_noise": 0.5, **changes}), LineWorld(**world)
+    settings, model = BeamSettings(**{"beam_noise": 0.5, **changes}), LineWorld(**world)
     model.deterministic = deterministic
     rng = np.random.default_rng(0)
     noise = draw_noise(rng, settings, len(ROOTS), 1)
@@ -88,7 +89,7 @@ def sizes_of(settings) -> tuple[int, int, bool]:
 @worlds
 @pytest.mark.parametrize("changes", TREES, ids=identify)
 def test_a_tree_that_holds_noise_equals_the_reference(changes, world):
-    settings = SearchSettings(strategy="tree", **{"beam_noise": 0.5, **changes})
+    settings = TreeSettings(**{"beam_noise": 0.5, **changes})
     model, rng = LineWorld(**world), np.random.default_rng(0)
     noise = draw_tree_noise(rng, settings, len(ROOTS), 1)
     result = tree_search(Roots(model, ROOTS, OBSERVATIONS), AGENT, settings, noise, rng)
@@ -103,18 +104,18 @@ def test_a_tree_that_holds_noise_equals_the_reference(changes, world):
 
 
 @worlds
-@pytest.mark.parametrize("changes", REFINEMENTS, ids=identify)
-def test_a_refinement_that_holds_noise_equals_the_reference(changes, world):
-    settings = SearchSettings(strategy="refine", **{"beam_noise": 0.5, **changes})
+@pytest.mark.parametrize("changes", PLANS, ids=identify)
+def test_the_cross_entropy_method_with_held_noise_equals_the_reference(changes, world):
+    settings = CEMSettings(**{"beam_noise": 0.5, **changes})
     model, rng = LineWorld(**world), np.random.default_rng(0)
     noise = draw_plan_noise(rng, settings, len(ROOTS), 1)
     remembered = rng.normal(scale=0.3, size=(len(ROOTS), settings.rollout_depth, 1)).astype(np.float32)
-    result = refine_search(Roots(model, ROOTS, OBSERVATIONS), AGENT, settings, noise, rng, remembered)
+    result = cem_search(Roots(model, ROOTS, OBSERVATIONS), AGENT, settings, noise, rng, remembered)
     plans = result.plans
     steps = 0
     for env, root in enumerate(ROOTS):
-        refinement = refinement_of(line_reference(model, root), settings)
-        outcome = refinement.choose(np.array([root]), noise[:, env], remembered[env])
+        reference = cem_of(line_reference(model, root), settings)
+        outcome = reference.choose(np.array([root]), noise[:, env], remembered[env])
         assert_agree(result, env, outcome)
         expected = np.zeros_like(plans[env]) if outcome.plan is None else outcome.plan
         np.testing.assert_allclose(plans[env], expected, rtol=1e-4, atol=1e-6)
@@ -122,17 +123,13 @@ def test_a_refinement_that_holds_noise_equals_the_reference(changes, world):
     assert result.simulated_steps == model.steps_taken == steps
 
 
-EVERY = [
-    *BEAMS,
-    *({"strategy": "tree", **changes} for changes in TREES),
-    *({"strategy": "refine", **changes} for changes in REFINEMENTS),
-]
+KINDS = ((BeamSettings, BEAMS), (TreeSettings, TREES), (CEMSettings, PLANS))
+EVERY = [cls(**{"n_simulations": 2, "beam_noise": 0.4, **changes}) for cls, kind in KINDS for changes in kind]
 
 
-@pytest.mark.parametrize("changes", EVERY, ids=identify)
+@pytest.mark.parametrize("settings", EVERY, ids=str)
 @pytest.mark.parametrize("spread", [0.0, 1e-9], ids=["deterministic", "random"])
-def test_simulated_steps_are_known_beforehand(changes, spread):
-    settings = SearchSettings(**{"n_simulations": 2, "beam_noise": 0.4, **changes})
+def test_simulated_steps_are_known_beforehand(settings, spread):
     model = LineWorld(spread=spread)
     rng = np.random.default_rng(0)
     result = search(Roots(model, ROOTS, OBSERVATIONS), AGENT, settings, rng)
@@ -142,7 +139,7 @@ def test_simulated_steps_are_known_beforehand(changes, spread):
 
 def test_what_is_left_of_a_plan_is_the_mean_of_what_it_held():
     """Macro-steps begin anew at every decision, so those of the last plan lie across them."""
-    settings = SearchSettings(8, 2, strategy="refine", beam_noise=0.3, noise_hold=2)
+    settings = CEMSettings(8, 2, beam_noise=0.3, noise_hold=2)
     memory, rng, x = WarmStart(1, 4, 1), np.random.default_rng(0), np.array([[1.0]])
     memory.keep(np.float32([[[0.1], [0.1], [0.4], [0.4]]]), [0], [(1, 0)])
     for moment, expected in (((1, 0), 0.1), ((1, 1), 0.25), ((1, 2), 0.4), ((1, 3), 0.2), ((2, 0), 0.0)):
@@ -194,10 +191,10 @@ def test_old_actions_are_forgotten_and_few_directions_are_none():
 
 
 HIERARCHICAL = [
-    SearchSettings(5, 2, 2, noise_hold=2, proposal_dims=2, beam_noise=0.3, n_threads=1),
-    SearchSettings(3, 2, strategy="tree", branching=2, noise_hold=2, proposal_dims=2, n_threads=1),
-    SearchSettings(6, 2, strategy="refine", noise_hold=2, proposal_dims=2, n_elites=3, n_threads=1),
-    SearchSettings(6, 3, strategy="refine", proposal_dims=1, include_policy_action=True, n_threads=1),
+    BeamSettings(5, 2, 2, noise_hold=2, proposal_dims=2, beam_noise=0.3, n_threads=1),
+    TreeSettings(3, 2, branching=2, noise_hold=2, proposal_dims=2, n_threads=1),
+    CEMSettings(6, 2, noise_hold=2, proposal_dims=2, n_elites=3, n_threads=1),
+    CEMSettings(6, 3, proposal_dims=1, include_policy_action=True, n_threads=1),
 ]
 
 
@@ -229,10 +226,8 @@ def test_real_environments(env_id, settings):
     else:
         noise = draw_plan_noise(rng, settings, 1, act_dim)
         remembered = rng.normal(scale=0.2, size=(1, settings.rollout_depth, act_dim)).astype(np.float32)
-        result = refine_search(*given, noise, rng, remembered, directions)
-        outcome = refinement_of(reference, settings, directions).choose(
-            observations[0], noise[:, 0], remembered[0]
-        )
+        result = cem_search(*given, noise, rng, remembered, directions)
+        outcome = cem_of(reference, settings, directions).choose(observations[0], noise[:, 0], remembered[0])
         np.testing.assert_allclose(result.plans[0], outcome.plan, rtol=1e-4, atol=1e-6)
     assert_agree(result, 0, outcome)
     assert result.simulated_steps == outcome.steps
@@ -242,7 +237,13 @@ def test_real_environments(env_id, settings):
 def test_candidates_lie_in_the_learned_directions():
     vec_env = snapshot_vec_env("HalfCheetah-v5", 2)
     agent = MCBSTD3("MlpPolicy", vec_env, seed=1, rollout_depth=0, **SMALL)
-    settings = dict(beam_width=8, rollout_depth=1, beam_noise=0.02, proposal_dims=2, n_threads=1)
+    settings = dict(
+        beam_width=8,
+        rollout_depth=1,
+        beam_noise=0.02,
+        search_kwargs=dict(proposal_dims=2),
+        model_kwargs=dict(n_threads=1),
+    )
     policy = SearchPolicy(agent, vec_env, seed=0, **settings)
     observations, ranks = vec_env.reset(), []
     for _ in range(ENOUGH // 2 + 1):
@@ -255,11 +256,11 @@ def test_candidates_lie_in_the_learned_directions():
     assert policy.planner.recent_actions.directions(2) is not None, "an episode's end forgets nothing"
     policy.close()
     with pytest.raises(ValueError, match="proposal_dims must be at most 6"):
-        SearchPolicy(agent, vec_env, proposal_dims=7)
+        SearchPolicy(agent, vec_env, search_kwargs=dict(proposal_dims=7))
 
 
 def test_a_deadline_searches_in_the_directions_and_holds_noise():
-    settings = SearchSettings(
+    settings = BeamSettings(
         4, 2, 2, time_budget=10, noise_hold=3, include_policy_action=True, proposal_dims=1
     )
     model, pace, rng = LineWorld(), LatencyForecast(), np.random.default_rng(0)
@@ -272,22 +273,34 @@ def test_a_deadline_searches_in_the_directions_and_holds_noise():
 
 
 REFUSED = [
-    (dict(noise_hold=2, rollout_depth=0), "noise_hold needs a rollout_depth"),
-    (dict(noise_hold=2, beam_noise=0.0, beam_width=1), "noise_hold holds noise"),
-    (dict(noise_hold=2, noise_clip=0, beam_width=1), "noise_hold holds noise"),
-    (dict(proposal_dims=2, beam_noise=0.0, beam_width=1), "proposal_dims needs a beam_noise"),
-    (dict(beam_width=1000, rollout_depth=100, noise_hold=100), r"rollout_depth \* noise_hold is"),
+    (dict(search_kwargs=dict(noise_hold=2), rollout_depth=0), "noise_hold needs a rollout_depth"),
+    (dict(search_kwargs=dict(noise_hold=2), beam_noise=0.0, beam_width=1), "noise_hold holds noise"),
+    (dict(search_kwargs=dict(noise_hold=2, noise_clip=0), beam_width=1), "noise_hold holds noise"),
+    (
+        dict(search_kwargs=dict(proposal_dims=2), beam_noise=0.0, beam_width=1),
+        "proposal_dims needs a beam_noise",
+    ),
+    (
+        dict(beam_width=1000, rollout_depth=100, search_kwargs=dict(noise_hold=100)),
+        r"rollout_depth \* noise_hold is",
+    ),
 ]
 
 
 @pytest.mark.parametrize("changes, words", REFUSED, ids=[words for _, words in REFUSED])
 def test_what_makes_no_sense_is_refused(changes, words):
     with pytest.raises(ValueError, match=words):
-        SearchSettings(**changes)
+        make_settings(**changes)
 
 
-TRAINED = dict(strategy="refine", beam_width=4, rollout_depth=2, n_rounds=1, noise_hold=2, n_simulations=1,
-               proposal_dims=1, n_threads=1)  # fmt: skip
+TRAINED = dict(
+    strategy="cem",
+    beam_width=4,
+    rollout_depth=2,
+    n_simulations=1,
+    search_kwargs=dict(n_rounds=1, noise_hold=2, proposal_dims=1),
+    model_kwargs=dict(n_threads=1),
+)
 
 
 def test_an_agent_remembers_its_actions_when_it_is_loaded(make_agent, tmp_path):

@@ -31,10 +31,9 @@ pytestmark = pytest.mark.usefixtures("small_ensembles")
 LEARNS = dict(
     forward_model="ensemble",
     learning_starts=100,
-    ensemble_size=2,
-    ensemble_train_freq=30,
-    ensemble_gradient_steps=120,
-    ensemble_max_error=0.8,
+    model_kwargs=dict(
+        ensemble_size=2, ensemble_train_freq=30, ensemble_gradient_steps=120, ensemble_max_error=0.8
+    ),
 )
 NOISE = NormalActionNoise(np.zeros(1), 0.3 * np.ones(1))
 
@@ -57,6 +56,7 @@ def no_snapshots(monkeypatch):
 @pytest.fixture
 def learning_agent(make_agent):
     def make(env=None, **settings):
+        settings["model_kwargs"] = {**LEARNS["model_kwargs"], **settings.get("model_kwargs", {})}
         return make_agent(linear_vec_env() if env is None else env, **{**LEARNS, **settings})
 
     return make
@@ -84,7 +84,7 @@ def test_agents_search_without_snapshots(learning_agent, no_snapshots, cls):
 
 @pytest.mark.parametrize("cls, plain", [(MCBSTD3, TD3), (MCBSSAC, SAC)])
 def test_it_changes_nothing_until_it_is_used(learning_agent, make_agent, cls, plain):
-    never = dict(ensemble_max_error=0.0, ensemble_gradient_steps=3)
+    never = dict(model_kwargs=dict(ensemble_max_error=0.0, ensemble_gradient_steps=3))
     faithful = dict(fast_update=False) if cls is MCBSTD3 else {}
     noise = dict(action_noise=deepcopy(NOISE)) if cls is MCBSTD3 else {}
     ours = learning_agent(cls=cls, **never, **faithful, **deepcopy(noise))
@@ -114,7 +114,7 @@ def test_it_is_put_aside_while_its_error_is_too_high(learning_agent):
 
 
 def test_an_agent_without_noise_explores_until_the_model_is_ready(learning_agent):
-    agent = learning_agent(ensemble_max_error=0.0, beam_noise=0.2).learn(101)
+    agent = learning_agent(model_kwargs=dict(ensemble_max_error=0.0), beam_noise=0.2).learn(101)
     assert agent._noise_without_search._sigma == pytest.approx(0.2)
 
 
@@ -163,13 +163,17 @@ def test_normalised_environments(learning_agent, no_snapshots):
 
 
 def test_vectorized_wrappers_that_no_other_model_knows(learning_agent, no_snapshots):
-    agent = learning_agent(VecFrameStack(linear_vec_env(), 3), ensemble_max_error=10).learn(130)
+    agent = learning_agent(
+        VecFrameStack(linear_vec_env(), 3), model_kwargs=dict(ensemble_max_error=10)
+    ).learn(130)
     assert agent.n_decisions > 0
 
 
 @pytest.mark.slow
 def test_worker_processes_need_no_wrapper(learning_agent, no_snapshots):
-    agent = learning_agent(linear_vec_env(2, SubprocVecEnv), ensemble_max_error=10).learn(130)
+    agent = learning_agent(linear_vec_env(2, SubprocVecEnv), model_kwargs=dict(ensemble_max_error=10)).learn(
+        130
+    )
     assert agent.n_decisions > 0
     agent.env.close()
 
@@ -177,9 +181,9 @@ def test_worker_processes_need_no_wrapper(learning_agent, no_snapshots):
 @pytest.mark.parametrize(
     "settings",
     [
-        dict(strategy="tree", branching=2),
-        dict(strategy="refine", n_simulations=1),
-        dict(time_budget=0.01),
+        dict(strategy="tree", search_kwargs=dict(branching=2)),
+        dict(strategy="cem", n_simulations=1),
+        dict(search_kwargs=dict(time_budget=0.01)),
         dict(search_share=0.5),
     ],
 )
@@ -200,8 +204,10 @@ def test_saved_and_loaded(learning_agent, tmp_path):
     loaded.learn(140, reset_num_timesteps=False)
     assert loaded.n_decisions > agent.n_decisions
     with pytest.raises(ValueError, match="ensemble_size is 3, and this agent has learned a model of 2"):
-        MCBSTD3.load(tmp_path / "agent", ensemble_size=3, device="cpu")
-    other = MCBSTD3.load(tmp_path / "agent", forward_model="auto", device="cpu")
+        MCBSTD3.load(tmp_path / "agent", model_kwargs=dict(ensemble_size=3), device="cpu")
+    with pytest.raises(TypeError, match="ensemble_size is for forward_model='ensemble'"):
+        MCBSTD3.load(tmp_path / "agent", forward_model="auto")
+    other = MCBSTD3.load(tmp_path / "agent", forward_model="auto", model_kwargs=None, device="cpu")
     assert other.learned_model is None
     read = load_agent(tmp_path / "agent.zip", env)
     with pytest.raises(ValueError, match="load_agent reads no learned model"):
@@ -224,9 +230,9 @@ def test_a_resumed_run_is_exact(make_agent, tmp_path, n_envs, crash_at):
         return snapshot_vec_env("Pendulum-v1", n_envs)
 
     def make(folder):
-        return make_agent(
-            make_env(folder), **{**LEARNS, "ensemble_max_error": 1.5}, action_noise=deepcopy(NOISE)
-        )
+        learned = {**LEARNS["model_kwargs"], "ensemble_max_error": 1.5}
+        settings = {**LEARNS, "model_kwargs": learned, "action_noise": deepcopy(NOISE)}
+        return make_agent(make_env(folder), **settings)
 
     whole, resumed = assert_resumed_is_exact(make, tmp_path, 200, crash_at, make_env=make_env)
     assert whole.n_decisions == resumed.n_decisions > 0
@@ -250,11 +256,11 @@ def test_a_resumed_run_is_exact(make_agent, tmp_path, n_envs, crash_at):
             "optimize_memory_usage",
         ),
         (dict(rollout_depth=0), ValueError, "rollout_depth of 1 or more"),
-        (dict(ensemble_size=1), ValueError, "ensemble_size"),
-        (dict(ensemble_train_freq=0), ValueError, "ensemble_train_freq"),
-        (dict(ensemble_gradient_steps=1.5), TypeError, "ensemble_gradient_steps"),
-        (dict(ensemble_max_error=-0.1), ValueError, "ensemble_max_error"),
-        (dict(ensemble_pessimism=np.nan), ValueError, "ensemble_pessimism"),
+        (dict(model_kwargs=dict(ensemble_size=1)), ValueError, "ensemble_size"),
+        (dict(model_kwargs=dict(ensemble_train_freq=0)), ValueError, "ensemble_train_freq"),
+        (dict(model_kwargs=dict(ensemble_gradient_steps=1.5)), TypeError, "ensemble_gradient_steps"),
+        (dict(model_kwargs=dict(ensemble_max_error=-0.1)), ValueError, "ensemble_max_error"),
+        (dict(model_kwargs=dict(ensemble_pessimism=np.nan)), ValueError, "ensemble_pessimism"),
     ],
 )
 def test_what_makes_no_sense_is_refused(learning_agent, settings, error, words):

@@ -114,7 +114,7 @@ def test_numbers_are_taken_over(saved):
 
 @pytest.mark.parametrize("cls", SEARCHING)
 def test_search_settings_are_taken_over(saved, cls):
-    agent, path = saved(cls, beam_width=7, rollout_noise=0.03, include_policy_action=True)
+    agent, path = saved(cls, beam_width=7, search_kwargs=dict(rollout_noise=0.03, include_policy_action=True))
     loaded = load(path)
     assert loaded.search_settings == agent.search_settings
     assert SearchPolicy(loaded, make_vec_env("Pendulum-v1", 1)).settings.beam_width == 7

@@ -323,13 +323,26 @@ def test_numbers_are_checked(saved, tmp_path, entry, value):
     [
         ("beam_width", 0), ("beam_width", True), ("beam_width", 10**9), ("rollout_depth", 2.5),
         ("beam_noise", float("nan")), ("beam_noise", 10**400), ("forward_model", ["auto"]),
-        ("n_threads", 10**6), ("include_policy_action", 1), ("time_budget", "now"),
+        ("model_kwargs", {"n_threads": 10**6}), ("model_kwargs", [1]), ("strategy", ["beam"]),
+        ("search_kwargs", {"include_policy_action": 1}), ("search_kwargs", {"time_budget": "now"}),
+        ("search_kwargs", {"branching": 2}), ("search_kwargs", 3),
     ],
 )  # fmt: skip
 def test_search_settings_are_checked(saved, tmp_path, entry, value):
     _, path = saved(MCBSTD3)
     with pytest.raises(AgentFileError, match=r"strange\.zip: search settings: .*"):
         load(files.with_data(path, tmp_path / "strange.zip", **{entry: value}))
+
+
+def test_settings_of_an_older_file_are_checked(saved, tmp_path):
+    _, path = saved(MCBSTD3)
+    flat = dict(search_kwargs=None, model_kwargs=None, branching=7, antithetic=True, n_threads=2)
+    agent = load(files.with_data(path, tmp_path / "older.zip", **flat))
+    assert agent.search_settings.antithetic and agent.model_kwargs == {"n_threads": 2}
+    assert not {"antithetic", "n_threads", "search_kwargs"} & agent.not_taken_over.keys()
+    for entry, value in (("n_threads", 10**6), ("antithetic", {}), ("rollout_noise", -1)):
+        with pytest.raises(AgentFileError, match=r"strange\.zip: search settings: .*"):
+            load(files.with_data(path, tmp_path / "strange.zip", **{**flat, entry: value}))
 
 
 def test_clip_mean_is_checked(saved, tmp_path):

@@ -84,8 +84,12 @@ SEARCHED = {
 @pytest.mark.parametrize("cls", SEARCHING)
 def test_a_search_is_around_the_present_actor(make_agent, cls, change):
     plain = make_agent(cls=WITHOUT_SEARCH[cls])
-    policy = SearchPolicy(plain, snapshot_vec_env("Pendulum-v1"), seed=0, include_policy_action=True)
-    training = make_agent(snapshot_vec_env("Pendulum-v1"), cls=cls, include_policy_action=True)
+    policy = SearchPolicy(
+        plain, snapshot_vec_env("Pendulum-v1"), seed=0, search_kwargs=dict(include_policy_action=True)
+    )
+    training = make_agent(
+        snapshot_vec_env("Pendulum-v1"), cls=cls, search_kwargs=dict(include_policy_action=True)
+    )
     for agent, planner, vec_env in (
         (plain, policy.planner, policy.vec_env),
         (training, training.planner, training.env),

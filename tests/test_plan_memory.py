@@ -1,4 +1,4 @@
-"""What a refinement remembers: shifted from decision to decision, dropped where an episode ended."""
+"""Plans of the cross-entropy method: shifted from decision to decision, dropped where an episode ended."""
 
 import gymnasium as gym
 import numpy as np
@@ -6,7 +6,7 @@ import pytest
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
-from sb3_mcbs import SearchPolicy, SearchSettings, SnapshotEnvWrapper
+from sb3_mcbs import CEMSettings, SearchPolicy, SnapshotEnvWrapper
 from sb3_mcbs.search import Roots, WarmStart, search
 from tests.checkpoint_helpers import assert_resumed_is_exact
 from tests.conftest import snapshot_vec_env
@@ -69,7 +69,7 @@ def test_a_wrapper_tells_moments_apart():
 
 def test_decisions_start_around_what_is_left_of_the_last_plan():
     """The first plan of a round is the mean, so it shows what was remembered."""
-    settings = SearchSettings(8, 3, strategy="refine", beam_noise=0.3)
+    settings = CEMSettings(8, 3, beam_noise=0.3)
     memory, rng, x = WarmStart(1, 3, 1), np.random.default_rng(0), 1.0
     for moment in [(1, 0), (1, 1), (1, 2), (2, 0), (2, 2)]:
         expected = AGENT.policy(np.array([[x]])) + memory.recall([0], [moment])[:, 0]
@@ -82,7 +82,14 @@ def test_decisions_start_around_what_is_left_of_the_last_plan():
         x = float(result.first_step.observations[0, 0])
 
 
-REFINE = dict(strategy="refine", beam_width=4, rollout_depth=3, n_rounds=2, n_simulations=1, beam_noise=0.3)
+CEM = dict(
+    strategy="cem",
+    beam_width=4,
+    rollout_depth=3,
+    search_kwargs=dict(n_rounds=2),
+    n_simulations=1,
+    beam_noise=0.3,
+)
 
 
 def recalled(planner) -> np.ndarray:
@@ -95,7 +102,7 @@ def test_episodes_of_vectorized_environments(make_agent, vec_env_cls):
     """Each environment's episodes end at other times, and end by themselves."""
     agent = make_agent("InvertedPendulum-v5", rollout_depth=0, n_simulations=1)
     env = snapshot_vec_env("InvertedPendulum-v5", 2, vec_env_cls=vec_env_cls)
-    policy = SearchPolicy(agent, env, seed=0, **REFINE)
+    policy = SearchPolicy(agent, env, seed=0, **CEM)
     observations = env.reset()
     assert not recalled(policy.planner).any()
     ends = [0, 0]
@@ -122,7 +129,7 @@ def test_a_seed_gives_the_same_returns_whatever_was_before(make_agent):
         env.seed(seed)
         return evaluate_policy(policy, env, 1)[0]
 
-    policy = SearchPolicy(agent, env, **REFINE)
+    policy = SearchPolicy(agent, env, **CEM)
     first, other, again = (episode(policy, seed) for seed in (1, 2, 1))
     assert first == again != other
     assert policy.planner.memory["plans"]["plans"].any(), "there were plans to be dropped"
@@ -135,7 +142,7 @@ def test_a_restored_search_goes_on_as_if_it_had_never_stopped(make_agent):
     def start():
         env = DummyVecEnv([lambda: SnapshotEnvWrapper(gym.make("InvertedPendulum-v5"))])
         env.seed(0)
-        return env, SearchPolicy(agent, env, seed=0, **REFINE), env.reset()
+        return env, SearchPolicy(agent, env, seed=0, **CEM), env.reset()
 
     env, policy, observations = start()
     for _ in range(3):
@@ -158,15 +165,14 @@ def test_a_restored_search_goes_on_as_if_it_had_never_stopped(make_agent):
         other.close()
 
 
-@pytest.mark.parametrize("strategy", ["tree", "refine"])
+@pytest.mark.parametrize("strategy", ["tree", "cem"])
 def test_agents_train_with_every_strategy(make_agent, strategy, make_dict_env):
     agent = make_agent(
         make_dict_env(),
         policy="MultiInputPolicy",
         strategy=strategy,
         beam_width=6,
-        branching=2,
-        n_proposals=18,
+        search_kwargs=dict(branching=2, n_proposals=18) if strategy == "tree" else dict(n_proposals=18),
     )
     agent.learn(28)  # later this actor is at its limits, where the best plan is to leave it alone
     assert agent.n_decisions == 8 and agent.n_simulated_steps > 0
@@ -186,7 +192,7 @@ def test_a_run_that_is_resumed_remembers_its_plans(make_agent, tmp_path, env_id,
         "set_state",
         lambda self, state, now: restored.append(state) or set_state(self, state, now),
     )
-    search = {**REFINE, "rollout_depth": 2, "n_rounds": 1, "buffer_size": 200}
+    search = {**CEM, "rollout_depth": 2, "search_kwargs": {"n_rounds": 1}, "buffer_size": 200}
 
     def make(folder):
         return make_agent(snapshot_vec_env(env_id, n_envs), **search)

@@ -10,7 +10,7 @@ from sb3_contrib import TQC
 from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_mcbs import MCBSDDPG, MCBSSAC, MCBSTD3, MCBSTQC, SearchSettings
+from sb3_mcbs import MCBSDDPG, MCBSSAC, MCBSTD3, MCBSTQC, BeamSettings
 from sb3_mcbs.agents.planner import Planner
 from sb3_mcbs.search import Roots, beam_search, draw_noise
 from tests.conftest import SMALL
@@ -91,7 +91,7 @@ def test_same_values_and_choice_with_every_agent(cls, settings):
 def assert_same_values_and_choice(cls, agent_settings, env_id, kwargs, kind, steps):
     vec_env = DummyVecEnv([lambda: gym.make(env_id, **kwargs)])
     vec_env.seed(3)
-    settings = SearchSettings(4, 3, 3, beam_noise=0.4, n_threads=1, forward_model=kind)
+    settings = BeamSettings(4, 3, 3, beam_noise=0.4, n_threads=1, forward_model=kind)
     agent = cls("MlpPolicy", vec_env, seed=1, rollout_depth=0, **agent_settings)
     planner = Planner(agent, vec_env, settings)
     rng = np.random.default_rng(0)
@@ -114,7 +114,7 @@ def test_rewards_are_exact():
     """With critics of zero a candidate's value is nothing but its rewards: equal to the last bit."""
     vec_env = DummyVecEnv([lambda: gym.make("Walker2d-v5")])
     vec_env.seed(0)
-    settings = SearchSettings(4, 4, 1, beam_noise=0.3, n_threads=2, forward_model="mujoco")
+    settings = BeamSettings(4, 4, 1, beam_noise=0.3, n_threads=2, forward_model="mujoco")
     agent = MCBSTD3("MlpPolicy", vec_env, seed=1, rollout_depth=0, **SMALL)
     planner = Planner(agent, vec_env, settings)
     rng = np.random.default_rng(5)
@@ -140,7 +140,7 @@ def test_normalised_observations_and_rewards():
     vec_env = VecNormalize(DummyVecEnv([lambda: gym.make("Hopper-v5")]), gamma=0.99)
     vec_env.seed(0)
     agent = MCBSTD3("MlpPolicy", vec_env, seed=1, rollout_depth=0, **SMALL)
-    settings = SearchSettings(3, 2, 2, beam_noise=0.3, n_threads=1)
+    settings = BeamSettings(3, 2, 2, beam_noise=0.3, n_threads=1)
     planner = Planner(agent, vec_env, settings, normalize_reward=True)
     rng = np.random.default_rng(2)
     walk(vec_env, 9, rng)

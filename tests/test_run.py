@@ -78,7 +78,7 @@ def test_dict_observations(make_agent, make_dict_env, cls):
 )
 def test_many_environments(make_agent, cls, env_id, vec_env_cls):
     env = VecMonitor(snapshot_vec_env(env_id, 2, vec_env_cls=vec_env_cls))
-    agent = make_agent(VecNormalize(env), cls=cls, n_threads=2)
+    agent = make_agent(VecNormalize(env), cls=cls, model_kwargs=dict(n_threads=2))
     agent.learn(60)
     assert agent.n_decisions == 40
     env.close()
@@ -124,7 +124,8 @@ def test_unknown_vectorized_wrapper_is_refused(make_agent):
 @pytest.mark.parametrize("cls", SEARCHING)
 def test_same_seed_same_run_and_threads_change_nothing(make_agent, cls):
     one, two, other = (
-        make_agent("Hopper-v5", cls=cls, seed=s, n_threads=n).learn(60) for s, n in [(3, 1), (3, 2), (4, 1)]
+        make_agent("Hopper-v5", cls=cls, seed=s, model_kwargs=dict(n_threads=n)).learn(60)
+        for s, n in [(3, 1), (3, 2), (4, 1)]
     )
     assert_same_parameters(one, two)
     np.testing.assert_array_equal(one.replay_buffer.actions[:60], two.replay_buffer.actions[:60])
@@ -292,7 +293,9 @@ def test_random_dynamics_are_simulated_with_generators_of_their_own(make_agent):
 
 def test_a_tree_does_not_follow_the_luckiest_draw_once_dynamics_turn_out_random(make_agent, monkeypatch):
     """The batched simulator is given up for copies first, which are found to be random then."""
-    agent = make_agent("InvertedPendulum-v5", strategy="tree", n_simulations=1, branching=2)
+    agent = make_agent(
+        "InvertedPendulum-v5", strategy="tree", n_simulations=1, search_kwargs=dict(branching=2)
+    )
     agent.learn(30)
     assert agent.planner.model.kind == "mujoco"
     step = InvertedPendulumEnv.step

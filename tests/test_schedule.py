@@ -8,7 +8,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 
 from sb3_mcbs import MCBSSAC, MCBSTD3, MCBSTQC
 from sb3_mcbs.agents.schedule import ScheduleSettings, SearchSchedule
-from sb3_mcbs.search import SearchSettings, draw_noise
+from sb3_mcbs.search import BeamSettings, draw_noise
 from sb3_mcbs.search.random_streams import spawn_rng
 from tests.checkpoint_helpers import assert_resumed_is_exact
 from tests.conftest import SEARCHING, WITHOUT_SEARCH, assert_same_parameters, snapshot_vec_env
@@ -149,7 +149,7 @@ def test_anneals():
     settings = ScheduleSettings(
         "anneal", search_share=1.0, final_search_share=0.2, final_beam_width=2, final_rollout_depth=5
     )
-    schedule, search = SearchSchedule(settings, 0), SearchSettings(10, 3)
+    schedule, search = SearchSchedule(settings, 0), BeamSettings(10, 3)
     assert [round(schedule.share(p), 3) for p in (0.0, 0.5, 1.0)] == [1.0, 0.6, 0.2]
     efforts = [schedule.settings_at(search, p) for p in (0.0, 0.5, 1.0)]
     assert [(e.beam_width, e.rollout_depth) for e in efforts] == [(10, 3), (6, 4), (2, 5)]
@@ -164,31 +164,57 @@ def test_anneals():
         (dict(search_share=1.5), {}, "search_share must be .* at most 1"),
         (dict(search_share=np.nan), {}, "search_share"),
         (dict(search_unit="epoch"), {}, "search_unit"),
-        (dict(final_search_share=0.5), {}, "final_search_share has no meaning"),
-        (dict(final_beam_width=3, search_schedule="saturation"), {}, "final_beam_width has no meaning"),
-        (dict(search_schedule="saturation", final_search_share=1.0), {}, "below search_share"),
+        (dict(schedule_kwargs=dict(final_search_share=0.5)), {}, "final_search_share has no meaning"),
+        (
+            dict(schedule_kwargs=dict(final_beam_width=3), search_schedule="saturation"),
+            {},
+            "final_beam_width has no meaning",
+        ),
+        (
+            dict(search_schedule="saturation", schedule_kwargs=dict(final_search_share=1.0)),
+            {},
+            "below search_share",
+        ),
         (dict(search_schedule="saturation", search_share=0.0), {}, "below search_share"),
-        (dict(search_schedule="saturation", recovery_tolerance=0.01), {}, "recovery_tolerance must be above"),
-        (dict(saturation_window=0), {}, "saturation_window"),
-        (dict(search_schedule="anneal", final_rollout_depth=0), {}, "both be 0 or both be 1"),
+        (
+            dict(search_schedule="saturation", schedule_kwargs=dict(recovery_tolerance=0.01)),
+            {},
+            "recovery_tolerance must be above",
+        ),
+        (dict(schedule_kwargs=dict(saturation_window=0)), {}, "saturation_window"),
+        (
+            dict(search_schedule="anneal", schedule_kwargs=dict(final_rollout_depth=0)),
+            {},
+            "both be 0 or both be 1",
+        ),
         (dict(search_schedule="anneal"), {}, "needs something to end at"),
         (
-            dict(search_schedule="anneal", final_beam_width=3),
-            dict(time_budget=1.0, max_beam_width=50),
+            dict(search_schedule="anneal", schedule_kwargs=dict(final_beam_width=3)),
+            dict(search_kwargs=dict(time_budget=1.0, max_beam_width=50)),
             "no meaning with max_beam_width",
         ),
         (
-            dict(search_schedule="anneal", final_beam_width=5, final_rollout_depth=5000),
+            dict(
+                search_schedule="anneal", schedule_kwargs=dict(final_beam_width=5, final_rollout_depth=5000)
+            ),
             dict(beam_width=20_000, rollout_depth=5, n_simulations=1),
             "widest and deepest search of the anneal",
         ),
-        (dict(search_schedule="anneal", final_rollout_depth=2), dict(strategy="refine"), "strategy='refine'"),
         (
-            dict(search_schedule="anneal", final_beam_width=3),
-            dict(strategy="tree", beam_width=4, n_proposals=24),
+            dict(search_schedule="anneal", schedule_kwargs=dict(final_rollout_depth=2)),
+            dict(strategy="cem"),
+            "strategy='cem'",
+        ),
+        (
+            dict(search_schedule="anneal", schedule_kwargs=dict(final_beam_width=3)),
+            dict(strategy="tree", beam_width=4, search_kwargs=dict(n_proposals=24)),
             "n_proposals of a tree",
         ),
-        (dict(search_schedule="anneal", final_beam_width=2), dict(n_elites=3), "At the end of the anneal"),
+        (
+            dict(search_schedule="anneal", schedule_kwargs=dict(final_beam_width=2)),
+            dict(strategy="cem", search_kwargs=dict(n_elites=3)),
+            "At the end of the anneal",
+        ),
     ],
 )
 def test_settings_without_a_meaning_are_refused(make_agent, settings, search, words):
@@ -324,7 +350,8 @@ def test_noise_for_what_is_not_searched_is_not_saved(make_agent, tmp_path):
 
 def test_what_is_logged(make_agent):
     agent = make_agent(
-        search_schedule="anneal", final_search_share=0.5, final_beam_width=1, final_rollout_depth=1
+        search_schedule="anneal",
+        schedule_kwargs=dict(final_search_share=0.5, final_beam_width=1, final_rollout_depth=1),
     )
     agent.learn(100)
     logged = agent.logger.name_to_value
@@ -337,8 +364,7 @@ def test_a_rollout_beyond_the_end_of_the_training_stays_at_the_end_of_the_anneal
     agent = make_agent(
         search_schedule="anneal",
         beam_width=widths[0],
-        final_beam_width=widths[1],
-        final_search_share=0.5,
+        schedule_kwargs=dict(final_beam_width=widths[1], final_search_share=0.5),
         train_freq=(1, "episode"),
     )
     agent.learn(250)
@@ -348,7 +374,7 @@ def test_a_rollout_beyond_the_end_of_the_training_stays_at_the_end_of_the_anneal
 
 
 def test_a_second_training_begins_at_the_beginning_of_the_anneal(make_agent):
-    agent = make_agent(search_schedule="anneal", final_beam_width=1)
+    agent = make_agent(search_schedule="anneal", schedule_kwargs=dict(final_beam_width=1))
     agent.learn(60)
     agent.learning_starts = 0
     agent.learn(1)
@@ -389,8 +415,8 @@ def test_a_resumed_run_keeps_its_schedule(make_agent, tmp_path, cls, unit):
         return VecNormalize(snapshot_vec_env("Pendulum-v1", 2))
 
     def make(folder):
-        settings = dict(SATURATION, saturation_window=20, search_unit=unit, search_share=0.8)
-        return make_agent(make_env(folder), cls=cls, **settings)
+        settings = ScheduleSettings("saturation", 0.8, unit, saturation_window=20)
+        return make_agent(make_env(folder), cls=cls, **settings.grouped())
 
     whole, resumed = assert_resumed_is_exact(make, tmp_path, 1300, 1105, make_env=make_env, save_freq=500)
     assert whole.n_decisions == resumed.n_decisions > 500
@@ -405,7 +431,7 @@ def test_a_resumed_run_keeps_its_schedule(make_agent, tmp_path, cls, unit):
 
 @pytest.mark.parametrize("cls", SEARCHING)
 def test_a_saved_agent_keeps_its_schedule_and_takes_new_settings(make_agent, tmp_path, cls):
-    agent = make_agent(cls=cls, **SATURATION)
+    agent = make_agent(cls=cls, **ScheduleSettings(**SATURATION).grouped())
     agent.learn(300)
     agent._schedule.saturation.is_reduced = True
     agent.save(tmp_path / "agent")

@@ -3,7 +3,15 @@
 import numpy as np
 import pytest
 
-from sb3_mcbs.search import Noise, PolicyFunctions, Roots, SearchSettings, beam_search, draw_noise
+from sb3_mcbs.search import (
+    BeamSettings,
+    Noise,
+    PolicyFunctions,
+    Roots,
+    beam_search,
+    draw_noise,
+    make_settings,
+)
 from tests.fake_model import LineWorld
 from tests.reference_search import Reference
 
@@ -68,7 +76,7 @@ LIMITS = {
 @pytest.mark.parametrize("width, depth, sims", [(1, 1, 1), (6, 3, 5), (4, 1, 3), (3, 7, 2)])
 def test_equals_the_reference(width, depth, sims, world):
     model = LineWorld(**world)
-    settings = SearchSettings(width, depth, sims, beam_noise=0.5)
+    settings = BeamSettings(width, depth, sims, beam_noise=0.5)
     roots = [0.3, -1.2, 1.0]
     noise = draw_noise(np.random.default_rng(0), settings, len(roots), 1)
     result = search(model, roots, settings, noise)
@@ -80,7 +88,7 @@ def test_equals_the_reference(width, depth, sims, world):
 
 
 def test_several_environments_equal_single_searches():
-    settings = SearchSettings(5, 4, 3, beam_noise=0.4)
+    settings = BeamSettings(5, 4, 3, beam_noise=0.4)
     roots = [0.3, -1.2, 1.0, 0.0]
     noise = draw_noise(np.random.default_rng(1), settings, len(roots), 1)
     together = search(LineWorld(1.3), roots, settings, noise)
@@ -91,7 +99,7 @@ def test_several_environments_equal_single_searches():
 
 
 def test_first_step_is_simulated_once_only_if_deterministic():
-    settings = SearchSettings(6, 3, 5)
+    settings = BeamSettings(6, 3, 5)
     noise = draw_noise(np.random.default_rng(0), settings, 1, 1)
     deterministic, random = LineWorld(), LineWorld(spread=0.1)
     assert search(deterministic, [0.0], settings, noise).simulated_steps == 66 == deterministic.steps_taken
@@ -99,7 +107,7 @@ def test_first_step_is_simulated_once_only_if_deterministic():
 
 
 def test_equal_simulations_run_once():
-    settings = SearchSettings(6, 3, 5, rollout_noise=0.0)
+    settings = BeamSettings(6, 3, 5, rollout_noise=0.0)
     noise = draw_noise(np.random.default_rng(0), settings, 1, 1)
     result = search(LineWorld(), [0.5], settings, noise)
     assert result.simulated_steps == 18
@@ -107,7 +115,7 @@ def test_equal_simulations_run_once():
 
 
 def test_diverged_candidates_are_never_chosen():
-    settings = SearchSettings(8, 2, 3, beam_noise=0.5)
+    settings = BeamSettings(8, 2, 3, beam_noise=0.5)
     noise = draw_noise(np.random.default_rng(0), settings, 1, 1)
     free = search(LineWorld(), [-2.0], settings, noise)
     limit = float(free.actions[0, 0]) - 1e-3  # forbids what would be best
@@ -118,7 +126,7 @@ def test_diverged_candidates_are_never_chosen():
 
 
 def test_policy_acts_if_all_candidates_diverge():
-    settings = SearchSettings(4, 2, 2)
+    settings = BeamSettings(4, 2, 2)
     noise = draw_noise(np.random.default_rng(0), settings, 2, 1)
     result = search(LineWorld(bad_action=-2.0), [0.5, -0.5], settings, noise)
     assert (result.chosen == -1).all()
@@ -129,7 +137,7 @@ def test_policy_acts_if_all_candidates_diverge():
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_critic_that_is_not_finite_is_never_followed(bad):
     agent = AGENT._replace(value=lambda obs, actions: np.where(actions[:, 0] > 0, bad, value(obs, actions)))
-    settings = SearchSettings(32, 0, 1, beam_noise=0.5)
+    settings = BeamSettings(32, 0, 1, beam_noise=0.5)
     noise = draw_noise(np.random.default_rng(0), settings, 1, 1)
     result = beam_search(Roots(None, [], np.array([[0.0]])), agent, settings, noise, np.random.default_rng(0))
     assert result.actions[0, 0] <= 0 < result.candidates.max()
@@ -137,7 +145,7 @@ def test_critic_that_is_not_finite_is_never_followed(bad):
 
 
 def test_depth_zero_ranks_by_the_critics():
-    settings = SearchSettings(16, 0, 5, beam_noise=0.5)
+    settings = BeamSettings(16, 0, 5, beam_noise=0.5)
     noise = draw_noise(np.random.default_rng(0), settings, 2, 1)
     observations = np.array([[0.7], [-0.2]])
     result = beam_search(Roots(None, [], observations), AGENT, settings, noise, np.random.default_rng(0))
@@ -148,7 +156,7 @@ def test_depth_zero_ranks_by_the_critics():
 
 
 def test_first_step_is_that_of_the_chosen_candidate():
-    settings = SearchSettings(6, 3, 5, beam_noise=0.3)
+    settings = BeamSettings(6, 3, 5, beam_noise=0.3)
     noise = draw_noise(np.random.default_rng(0), settings, 2, 1)
     roots = [0.4, -0.9]
     result = search(LineWorld(), roots, settings, noise)
@@ -158,16 +166,16 @@ def test_first_step_is_that_of_the_chosen_candidate():
 
 
 def test_policy_action_can_be_a_candidate():
-    noise = draw_noise(np.random.default_rng(0), SearchSettings(), 1, 1)
-    without = search(LineWorld(), [0.5], SearchSettings(), noise)
-    included = search(LineWorld(), [0.5], SearchSettings(include_policy_action=True), noise)
+    noise = draw_noise(np.random.default_rng(0), BeamSettings(), 1, 1)
+    without = search(LineWorld(), [0.5], BeamSettings(), noise)
+    included = search(LineWorld(), [0.5], BeamSettings(include_policy_action=True), noise)
     np.testing.assert_array_equal(included.candidates[0, 0], policy(np.array([0.5])))
     assert included.candidates[0, 0] != without.candidates[0, 0]
     np.testing.assert_array_equal(included.candidates[0, 1:], without.candidates[0, 1:])
 
 
 def test_candidates_stay_in_the_action_space_and_noise_is_clipped():
-    settings = SearchSettings(200, 2, 2, beam_noise=3.0, noise_clip=0.25)
+    settings = BeamSettings(200, 2, 2, beam_noise=3.0, noise_clip=0.25)
     noise = draw_noise(np.random.default_rng(0), settings, 1, 1)
     assert np.abs(noise.beam).max() == np.abs(noise.rollout).max() == 0.25
     result = search(LineWorld(), [10.0], settings, noise)
@@ -175,7 +183,7 @@ def test_candidates_stay_in_the_action_space_and_noise_is_clipped():
 
 
 def test_noise_scales_and_seeds():
-    settings = SearchSettings(50, 4, 10, beam_noise=0.3, rollout_noise=0.05)
+    settings = BeamSettings(50, 4, 10, beam_noise=0.3, rollout_noise=0.05)
     noise = draw_noise(np.random.default_rng(7), settings, 3, 2)
     assert noise.beam.shape == (3, 50, 2) and noise.rollout.shape == (4, 3, 50, 10, 2)
     assert noise.beam.std() == pytest.approx(0.3, rel=0.15)
@@ -196,17 +204,17 @@ def test_noise_scales_and_seeds():
         ({"beam_noise": -0.1}, ValueError, "beam_noise"),
         ({"beam_noise": float("nan")}, ValueError, "beam_noise"),
         ({"beam_noise": "0.1"}, TypeError, "beam_noise"),
-        ({"rollout_noise": float("inf")}, ValueError, "rollout_noise"),
-        ({"noise_clip": -1.0}, ValueError, "noise_clip"),
-        ({"include_policy_action": 1}, TypeError, "include_policy_action"),
-        ({"n_threads": -2}, ValueError, "n_threads"),
+        ({"search_kwargs": {"rollout_noise": float("inf")}}, ValueError, "rollout_noise"),
+        ({"search_kwargs": {"noise_clip": -1.0}}, ValueError, "noise_clip"),
+        ({"search_kwargs": {"include_policy_action": 1}}, TypeError, "include_policy_action"),
+        ({"model_kwargs": {"n_threads": -2}}, ValueError, "n_threads"),
         ({"forward_model": "magic"}, ValueError, "forward_model"),
     ],
 )
 def test_bad_settings_are_named(settings, error, words):
     with pytest.raises(error, match=words):
-        SearchSettings(**settings)
+        make_settings(**settings)
 
 
 def test_numpy_numbers_are_settings_too():
-    assert SearchSettings(beam_width=np.int64(4), beam_noise=np.float32(0.5)).beam_width == 4
+    assert BeamSettings(beam_width=np.int64(4), beam_noise=np.float32(0.5)).beam_width == 4

@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import (
     sync_envs_normalization,
 )
 
-from sb3_mcbs import MCBSTD3, SearchPolicy, SearchSettings, SnapshotEnvWrapper
+from sb3_mcbs import MCBSTD3, BeamSettings, SearchPolicy, SearchSettings, SnapshotEnvWrapper
 from sb3_mcbs.models.copies import _COPIES
 from tests.conftest import SEARCHING, SMALL_SEARCH, snapshot_vec_env
 
@@ -102,7 +102,7 @@ def test_settings_default_to_the_agents(make_agent):
     agent = make_agent(beam_width=5)
     assert SearchPolicy(agent, env).settings == agent.search_settings
     assert SearchPolicy(agent, env, rollout_depth=1).settings.beam_width == 5
-    assert SearchPolicy(make_agent(cls=TD3), env).settings == SearchSettings()
+    assert SearchPolicy(make_agent(cls=TD3), env).settings == BeamSettings()
     with pytest.raises(TypeError, match="beam_with"):
         SearchPolicy(agent, env, beam_with=3)
 

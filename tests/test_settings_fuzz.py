@@ -18,8 +18,25 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.noise import NormalActionNoise
 
-from sb3_mcbs import MCBSTD3, MCBSTQC, SearchPolicy, SearchSettings, SnapshotEnvWrapper
-from sb3_mcbs.search import LatencyForecast, PolicyFunctions, Roots, deadline_search, search
+from sb3_mcbs import (
+    MCBSTD3,
+    MCBSTQC,
+    BeamSettings,
+    CEMSettings,
+    SearchPolicy,
+    SearchSettings,
+    SnapshotEnvWrapper,
+    TreeSettings,
+)
+from sb3_mcbs.search import (
+    LatencyForecast,
+    PolicyFunctions,
+    Roots,
+    deadline_search,
+    make_settings,
+    search,
+)
+from sb3_mcbs.search.settings import STRATEGIES
 from tests.conftest import SMALL, snapshot_vec_env
 from tests.fake_model import LineWorld
 
@@ -58,44 +75,83 @@ VALID = {
     "rollout_depth": integers(0, 3),
     "n_simulations": integers(1, 3),
     "beam_noise": numbers(),
+    "forward_model": st.sampled_from(["auto", "mujoco", "pool", np.str_("pool")]),
+    "matmul_precision": st.sampled_from([None, "highest", "high", "medium"]),
+}
+assert VALID.keys() == set(SearchSettings.flat)
+IN_SEARCH_KWARGS = {
     "rollout_noise": st.none() | numbers(),
     "noise_clip": st.none() | numbers(),
     "include_policy_action": st.booleans(),
-    "n_threads": integers(0, 2),
-    "forward_model": st.sampled_from(["auto", "mujoco", "pool", np.str_("pool")]),
-    "matmul_precision": st.sampled_from([None, "highest", "high", "medium"]),
-    "time_budget": st.none() | numbers(1e-6).map(lambda seconds: min(seconds, 0.01)),
-    "max_beam_width": st.none() | integers(1, 6),
-    "strategy": st.sampled_from(["beam", "tree", "refine", np.str_("tree")]),
     "n_proposals": st.none() | integers(1, 30),
     "antithetic": st.booleans(),
+    "noise_hold": integers(1, 3),
+    "proposal_dims": st.none() | integers(1, 1),  # actions have one entry here
+    "time_budget": st.none() | numbers(1e-6).map(lambda seconds: min(seconds, 0.01)),
+    "max_beam_width": st.none() | integers(1, 6),
     "branching": integers(1, 3),
     "n_rounds": integers(1, 3),
     "n_elites": st.none() | integers(1, 5),
     "min_noise": numbers(),
-    "noise_hold": integers(1, 3),
-    "proposal_dims": st.none() | integers(1, 1),  # actions have one entry here
 }
-assert VALID.keys() == set(SearchSettings.names())
+assert IN_SEARCH_KWARGS.keys() == {key for cls in STRATEGIES.values() for key in cls.in_group()}
+IN_MODEL_KWARGS = {"n_threads": integers(0, 2)}
+GROUPS = {"search_kwargs": IN_SEARCH_KWARGS, "model_kwargs": IN_MODEL_KWARGS}
 
-valid_mostly = st.fixed_dictionaries({}, optional=VALID)
-one_wrong = st.sampled_from(sorted(VALID)).flatmap(
-    lambda name: st.tuples(valid_mostly, WRONG).map(lambda pair: {**pair[0], name: pair[1]})
-)
+
+def of_strategy(strategy: str) -> st.SearchStrategy:
+    own = {key: IN_SEARCH_KWARGS[key] for key in STRATEGIES[strategy].in_group()}
+    groups = {
+        name: st.none() | st.fixed_dictionaries({}, optional=group)
+        for name, group in (("search_kwargs", own), ("model_kwargs", IN_MODEL_KWARGS))
+    }
+    return st.fixed_dictionaries(
+        {"strategy": st.sampled_from([strategy, np.str_(strategy)])},
+        optional={**VALID, **groups},
+    )
+
+
+valid_mostly = st.sampled_from(sorted(STRATEGIES)).flatmap(of_strategy)
+
+
+def put(kwargs: dict[str, Any], name: str, value: Any) -> dict[str, Any]:
+    """Settings with another value, whether it is of a keyword or of a key."""
+    group = next((group for group, known in GROUPS.items() if name in known), None)
+    if group is None:
+        return {**kwargs, name: value}
+    return {**kwargs, group: {**(kwargs.get(group) or {}), name: value}}
+
+
+def with_one(names: dict[str, Any], values: Any, settings: st.SearchStrategy) -> st.SearchStrategy:
+    """Settings of which one, of any strategy, is drawn from elsewhere."""
+    return st.sampled_from(sorted(names)).flatmap(
+        lambda name: st.tuples(settings, values(name)).map(lambda pair: put(pair[0], name, pair[1]))
+    )
+
+
+ALL = {**VALID, **IN_SEARCH_KWARGS, **IN_MODEL_KWARGS, "strategy": None, **GROUPS}
+one_wrong = with_one(ALL, lambda name: WRONG, valid_mostly)
+
+
+def names_in(kwargs: dict[str, Any]) -> set[str]:
+    """The keywords and keys that are given."""
+    groups = (kwargs[group] for group in GROUPS if isinstance(kwargs.get(group), dict))
+    return {*kwargs, *(key for group in groups for key in group)}
 
 
 def made(kwargs: dict[str, Any]) -> SearchSettings | None:
     """The settings, or None if they are refused as they should be."""
     try:
-        return SearchSettings(**kwargs)
+        return make_settings(**kwargs)
     except (TypeError, ValueError) as error:
-        assert any(name in str(error) for name in kwargs), f"no setting is named: {error}"
+        assert any(name in str(error) for name in names_in(kwargs)), f"no setting is named: {error}"
         return None
 
 
 def small(found: SearchSettings) -> bool:
-    widest = max(found.beam_width, found.max_beam_width or 0)
-    factors = (found.n_simulations, max(found.horizon, 1), found.branching, found.n_rounds)
+    widest = max(found.beam_width, getattr(found, "max_beam_width", None) or 0)
+    times = getattr(found, "branching", 1) * getattr(found, "n_rounds", 1)
+    factors = (found.n_simulations, max(found.horizon, 1), times)
     return (
         widest * math.prod(factors) <= 10_000
         and (found.n_proposals or 0) <= 1000
@@ -119,7 +175,7 @@ def test_settings_are_refused_or_search_a_small_world(kwargs: dict[str, Any]) ->
         act_dim=1,
     )
     rng, roots = np.random.default_rng(0), Roots(LineWorld(), [0.5, -1.0], np.array([[0.5], [-1.0]]))
-    if found.time_budget is None:
+    if getattr(found, "time_budget", None) is None:
         result = search(roots, agent, found, rng)
     else:
         pace = LatencyForecast()
@@ -134,11 +190,16 @@ def pendulums() -> dict[str, tuple[MCBSTQC, Any]]:
     """An agent that no setting is refused for and its environments, for each kind of forward model."""
     return {
         env_id: (
-            MCBSTQC("MlpPolicy", env_id, seed=0, n_threads=1, **deepcopy(SMALL)),
+            MCBSTQC("MlpPolicy", env_id, seed=0, **deepcopy(SMALL)),
             snapshot_vec_env(env_id, 2),
         )
         for env_id in ("Pendulum-v1", "InvertedPendulum-v5")
     }
+
+
+def on_one_thread(kwargs: dict[str, Any]) -> dict[str, Any]:
+    given = kwargs.get("model_kwargs")
+    return {**kwargs, "model_kwargs": {"n_threads": 1, **given} if isinstance(given, dict) else given or {}}
 
 
 def is_batched(env_id: str, found: SearchSettings) -> bool:
@@ -153,7 +214,7 @@ def test_valid_settings_search_in_environments(pendulums, env_id: str, kwargs: d
     if found is None or not is_batched(env_id, found):
         return
     agent, vec_env = pendulums[env_id]
-    policy = SearchPolicy(agent, vec_env, seed=0, **{"n_threads": 1, **kwargs})
+    policy = SearchPolicy(agent, vec_env, seed=0, **on_one_thread(kwargs))
     observations = vec_env.reset()
     for _ in range(2):
         actions, _ = policy.predict(observations)
@@ -164,17 +225,13 @@ def test_valid_settings_search_in_environments(pendulums, env_id: str, kwargs: d
 
 
 OWN = {
-    **VALID,
     "action_noise_after_search": st.booleans(),
     "fast_update": st.booleans(),
     "preset": st.sampled_from([None, "paper", "efficient", "balanced"]),
     "action_noise": st.sampled_from([None, NormalActionNoise(np.zeros(1), np.ones(1))]),
 }
-one_own = st.sampled_from(sorted(OWN)).flatmap(
-    lambda name: st.tuples(st.fixed_dictionaries({}, optional=OWN), st.one_of(OWN[name], WRONG)).map(
-        lambda pair: {**pair[0], name: pair[1]}
-    )
-)
+owned = st.tuples(valid_mostly, st.fixed_dictionaries({}, optional=OWN)).map(lambda pair: pair[0] | pair[1])
+one_own = with_one({**ALL, **OWN}, lambda name: st.one_of(OWN.get(name, st.nothing()), WRONG), owned)
 
 
 @settings(fuzz, max_examples=50)
@@ -183,21 +240,19 @@ def test_agents_are_refused_or_train(kwargs: dict[str, Any]) -> None:
     # What is SB3's own is not checked here.
     if not isinstance(kwargs.get("action_noise"), NormalActionNoise | None):
         kwargs["action_noise"] = None
-    search = {name: value for name, value in kwargs.items() if name in VALID}
+    search = {name: value for name, value in kwargs.items() if name in ALL}
     try:
-        SearchSettings(**search)
-        fits = small(SearchSettings(**search)) and search.get("forward_model") != "mujoco"
+        fits = small(make_settings(**search)) and search.get("forward_model") != "mujoco"
     except (TypeError, ValueError):
         fits = True
     if not fits:
         return
     threads = th.get_num_threads()
     try:
-        agent = MCBSTD3(
-            "MlpPolicy", "Pendulum-v1", seed=0, learning_starts=4, **SMALL, **{"n_threads": 1, **kwargs}
-        )
+        more = on_one_thread(kwargs)
+        agent = MCBSTD3("MlpPolicy", "Pendulum-v1", seed=0, learning_starts=4, **SMALL, **more)
     except (TypeError, ValueError) as error:
-        assert any(name in str(error) for name in kwargs), error
+        assert any(name in str(error) for name in names_in(kwargs)), error
         return
     with warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
@@ -211,7 +266,7 @@ def test_agents_are_refused_or_train(kwargs: dict[str, Any]) -> None:
 def test_a_search_policy_refuses_what_it_does_not_know(pendulums, name: str, value: Any) -> None:
     agent, vec_env = pendulums["Pendulum-v1"]
     for kwargs in ({f"x_{name}": value}, {"beam_width": 1, f"beam_{name}_": value}):
-        with pytest.raises(TypeError, match="Unknown search settings"):
+        with pytest.raises(TypeError, match="unexpected keyword argument"):
             SearchPolicy(agent, vec_env, **kwargs)
     if value is not None and not isinstance(value, bool):
         with pytest.raises(TypeError, match="normalize_reward must be"):
@@ -236,30 +291,18 @@ def test_what_becomes_of_generators(rng: Any) -> None:
 
 
 def test_sizes_that_are_valid_but_not_together() -> None:
-    largest = SearchSettings(beam_width=100_000, rollout_depth=100, n_simulations=1)
+    largest = BeamSettings(beam_width=100_000, rollout_depth=100, n_simulations=1)
     assert largest.beam_width == 100_000
-    for kwargs, words in (
-        (
-            dict(beam_width=100_000, rollout_depth=101, n_simulations=1),
-            r"beam_width \* n_simulations \* rollout_depth",
-        ),
-        (
-            dict(beam_width=np.int16(20_000), n_simulations=np.int16(20_000)),
-            r"beam_width \* n_simulations is 400000000",
-        ),
-        (dict(time_budget=1, max_beam_width=100_000, n_simulations=2), r"max_beam_width \* n_simulations"),
-        (
-            dict(strategy="tree", beam_width=1000, branching=1000),
-            r"beam_width \* branching \* n_simulations",
-        ),
-        (
-            dict(strategy="refine", beam_width=1000, n_rounds=1000),
-            r"beam_width \* n_rounds \* n_simulations",
-        ),
-        (
-            dict(strategy="refine", n_proposals=1000, n_rounds=1000),
-            r"n_proposals \* n_rounds \* n_simulations",
-        ),
-    ):
+    many = np.int16(20_000)
+    for cls, kwargs, words in (
+        (BeamSettings, dict(beam_width=100_000, rollout_depth=101, n_simulations=1),
+         r"beam_width \* n_simulations \* rollout_depth"),
+        (BeamSettings, dict(beam_width=many, n_simulations=many), r"width \* n_simulations is 400000000"),
+        (BeamSettings, dict(time_budget=1, max_beam_width=100_000, n_simulations=2),
+         r"max_beam_width \* n_simulations"),
+        (TreeSettings, dict(beam_width=1000, branching=1000), r"beam_width \* branching \* n_simulations"),
+        (CEMSettings, dict(beam_width=1000, n_rounds=1000), r"beam_width \* n_rounds \* n_simulations"),
+        (CEMSettings, dict(n_proposals=1000, n_rounds=1000), r"n_proposals \* n_rounds \* n_simulations"),
+    ):  # fmt: skip
         with pytest.raises(ValueError, match=words):
-            SearchSettings(**kwargs)
+            cls(**kwargs)

@@ -1,20 +1,20 @@
-"""Tree and refinement against their plain transcriptions, and what all strategies promise."""
+"""Tree and cross-entropy method against their plain transcriptions, and what all strategies promise."""
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_mcbs import MCBSTD3, SearchPolicy, SearchSettings
+from sb3_mcbs import MCBSTD3, CEMSettings, SearchPolicy, SearchSettings, TreeSettings
 from sb3_mcbs.agents.planner import Planner
 from sb3_mcbs.agents.roots import EnvironmentStep, Prediction
-from sb3_mcbs.search import Roots, check_dynamics, search
-from sb3_mcbs.search.refine import draw_plan_noise, first_spread, refine_search
+from sb3_mcbs.search import Roots, check_dynamics, make_settings, search
+from sb3_mcbs.search.cem import cem_search, draw_plan_noise, first_spread
 from sb3_mcbs.search.tree import draw_tree_noise, tree_search
 from tests.conftest import SMALL, snapshot_vec_env
 from tests.fake_model import LineWorld
 from tests.reference_search import Reference
-from tests.reference_strategies import Outcome, ReferenceRefine, ReferenceTree
+from tests.reference_strategies import Outcome, ReferenceCEM, ReferenceTree
 from tests.test_reference import reference_for, walk
 from tests.test_search import AGENT, GAMMA, critics, policy
 
@@ -55,8 +55,8 @@ def tree_of(reference: Reference, settings: SearchSettings) -> ReferenceTree:
     )
 
 
-def refinement_of(reference: Reference, settings: SearchSettings) -> ReferenceRefine:
-    return ReferenceRefine(
+def cem_of(reference: Reference, settings: SearchSettings) -> ReferenceCEM:
+    return ReferenceCEM(
         reference,
         settings.beam_width,
         settings.effective_n_elites,
@@ -98,7 +98,7 @@ TREES = [
     dict(beam_width=3, branching=3, rollout_depth=3, antithetic=True),
     dict(beam_width=2, branching=2, rollout_depth=3, include_policy_action=True, n_proposals=12),
 ]
-REFINEMENTS = [
+PLANS = [
     dict(beam_width=2, n_rounds=1, rollout_depth=1),
     dict(beam_width=8, n_rounds=3, rollout_depth=3, n_elites=3),
     dict(beam_width=6, n_rounds=3, rollout_depth=4, include_policy_action=True, rollout_noise=0.1),
@@ -117,7 +117,7 @@ def identify(changes):
 @pytest.mark.parametrize("world", WORLDS.values(), ids=WORLDS)
 @pytest.mark.parametrize("changes", TREES, ids=identify)
 def test_tree_equals_the_reference(changes, world):
-    settings = SearchSettings(strategy="tree", **{"beam_noise": 0.5, **changes})
+    settings = TreeSettings(**{"beam_noise": 0.5, **changes})
     model = LineWorld(**world)
     noise = draw_tree_noise(np.random.default_rng(0), settings, len(ROOTS), 1)
     result = on_line(model, settings)
@@ -134,10 +134,10 @@ def test_tree_equals_the_reference(changes, world):
 
 
 @pytest.mark.parametrize("world", WORLDS.values(), ids=WORLDS)
-@pytest.mark.parametrize("changes", REFINEMENTS, ids=identify)
+@pytest.mark.parametrize("changes", PLANS, ids=identify)
 @pytest.mark.parametrize("warm", [False, True], ids=["cold", "warm"])
-def test_refinement_equals_the_reference(changes, world, warm):
-    settings = SearchSettings(strategy="refine", **{"beam_noise": 0.5, **changes})
+def test_the_cross_entropy_method_equals_the_reference(changes, world, warm):
+    settings = CEMSettings(**{"beam_noise": 0.5, **changes})
     model = LineWorld(**world)
     rng = np.random.default_rng(0)
     noise = draw_plan_noise(rng, settings, len(ROOTS), 1)
@@ -145,11 +145,11 @@ def test_refinement_equals_the_reference(changes, world, warm):
     if warm:
         remembered[1:] = rng.normal(scale=0.3, size=remembered[1:].shape)
     observations = np.array(ROOTS)[:, None]
-    result = refine_search(Roots(model, ROOTS, observations), AGENT, settings, noise, rng, remembered)
+    result = cem_search(Roots(model, ROOTS, observations), AGENT, settings, noise, rng, remembered)
     plans = result.plans
     steps = 0
     for env, root in enumerate(ROOTS):
-        reference = refinement_of(line_reference(model, root), settings)
+        reference = cem_of(line_reference(model, root), settings)
         outcome = reference.choose(np.array([root]), noise[:, env], remembered[env])
         assert_agree(result, env, outcome)
         expected = np.zeros_like(plans[env]) if outcome.plan is None else outcome.plan
@@ -174,8 +174,8 @@ def test_real_environments(env_id, kwargs, kind, steps):
     vec_env.seed(3)
     act_dim = vec_env.action_space.shape[0]
     options = dict(beam_noise=0.4, n_threads=1, forward_model=kind)
-    tree = SearchSettings(3, 3, 1, strategy="tree", branching=2, **options)
-    refine = SearchSettings(4, 3, 1, strategy="refine", n_rounds=2, n_elites=2, **options)
+    tree = TreeSettings(3, 3, 1, branching=2, **options)
+    cem = CEMSettings(4, 3, 1, n_rounds=2, n_elites=2, **options)
     agent = MCBSTD3("MlpPolicy", vec_env, seed=1, rollout_depth=0, **SMALL)
     planner = Planner(agent, vec_env, tree)
     rng = np.random.default_rng(0)
@@ -192,10 +192,10 @@ def test_real_environments(env_id, kwargs, kind, steps):
         assert result.simulated_steps == outcome.steps
         fewer_steps |= outcome.steps < tree.simulated_steps()
 
-        noise = draw_plan_noise(rng, refine, 1, act_dim)
+        noise = draw_plan_noise(rng, cem, 1, act_dim)
         remembered = rng.normal(scale=0.2, size=(1, 3, act_dim)).astype(np.float32)
-        result = refine_search(*given, refine, noise, rng, remembered)
-        outcome = refinement_of(reference, refine).choose(observations[0], noise[:, 0], remembered[0])
+        result = cem_search(*given, cem, noise, rng, remembered)
+        outcome = cem_of(reference, cem).choose(observations[0], noise[:, 0], remembered[0])
         assert_agree(result, 0, outcome)
         np.testing.assert_allclose(result.plans[0], outcome.plan, rtol=1e-4, atol=1e-6)
         assert result.simulated_steps == outcome.steps
@@ -204,16 +204,16 @@ def test_real_environments(env_id, kwargs, kind, steps):
 
 EVERY = [
     dict(strategy="beam", rollout_depth=3),
-    dict(strategy="beam", n_proposals=20, antithetic=True),
-    dict(strategy="tree", branching=3),
-    dict(strategy="tree", branching=2, n_proposals=24),
-    dict(strategy="refine"),
-    dict(strategy="refine", n_proposals=15, antithetic=True, include_policy_action=True),
+    dict(strategy="beam", search_kwargs=dict(n_proposals=20, antithetic=True)),
+    dict(strategy="tree", search_kwargs=dict(branching=3)),
+    dict(strategy="tree", search_kwargs=dict(branching=2, n_proposals=24)),
+    dict(strategy="cem"),
+    dict(strategy="cem", search_kwargs=dict(n_proposals=15, antithetic=True, include_policy_action=True)),
 ]
 
 
 def settings_of(changes) -> SearchSettings:
-    return SearchSettings(**{"beam_width": 6, "n_simulations": 2, "beam_noise": 0.4, **changes})
+    return make_settings(**{"beam_width": 6, "n_simulations": 2, "beam_noise": 0.4, **changes})
 
 
 @pytest.mark.parametrize("changes", EVERY, ids=identify)
@@ -246,7 +246,7 @@ def test_several_environments_equal_single_searches(changes):
         """What it draws is the same in every environment, however many there are."""
 
         def standard_normal(self, shape, dtype):
-            axis = 0 if len(shape) < 5 else 1  # arrays of a whole rollout, tree or refinement have 5 axes
+            axis = 0 if len(shape) < 5 else 1  # arrays of a whole rollout, tree or of plans have 5 axes
             alone = (*shape[:axis], 1, *shape[axis + 1 :])
             return np.repeat(super().standard_normal(alone, dtype=dtype), shape[axis], axis=axis)
 
@@ -264,7 +264,7 @@ def test_several_environments_equal_single_searches(changes):
 @pytest.mark.parametrize("changes", [c for c in EVERY if c["strategy"] != "beam"], ids=identify)
 def test_simulations_of_a_random_world_without_spread_are_all_the_same(changes):
     """With several rows per node or plan, in other words, every row is where it belongs."""
-    settings = settings_of({**changes, "n_simulations": 3, "rollout_noise": None})
+    settings = settings_of({**changes, "n_simulations": 3})
     model = LineWorld(1.3, 0.5)
     expected = on_line(model, settings)
     model.deterministic = False
@@ -277,14 +277,14 @@ def test_simulations_of_a_random_world_without_spread_are_all_the_same(changes):
 
 def test_a_tree_in_a_random_world_follows_the_mean():
     """One root action, whose nodes' values are means over many draws: nearly that of a world without."""
-    settings = SearchSettings(2, 3, 20_000, beam_noise=0.3, strategy="tree", branching=2)
+    settings = TreeSettings(2, 3, 20_000, beam_noise=0.3, branching=2)
     value = on_line(LineWorld(spread=0.05), settings, roots=[0.5]).values.max()
     certain = on_line(LineWorld(), settings, roots=[0.5]).values.max()
     # Later rewards are -x^2, whose mean is lower by the variance of x.
     variance = 0.05**2
     expected = certain - variance * (1 + 2 * GAMMA + 3 * GAMMA**2)
     assert value == pytest.approx(expected, abs=0.03)
-    single = SearchSettings(2, 3, 1, strategy="tree")
+    single = TreeSettings(2, 3, 1)
     with pytest.raises(ValueError, match="n_simulations of 2 or more"):
         check_dynamics(single, deterministic=False)
     check_dynamics(single, deterministic=True)
@@ -292,7 +292,9 @@ def test_a_tree_in_a_random_world_follows_the_mean():
 
 def test_a_tree_of_proposals_stops_where_every_node_has_terminated(make_agent):
     env = snapshot_vec_env("InvertedPendulum-v5")
-    agent = make_agent(env, strategy="tree", beam_width=2, branching=2, n_proposals=8, rollout_depth=6)
+    agent = make_agent(
+        env, strategy="tree", beam_width=2, search_kwargs=dict(branching=2, n_proposals=8), rollout_depth=6
+    )
     policy = SearchPolicy(agent, env, beam_noise=0.5, seed=0)
     env.reset()
     env.env_method("set_state", np.array([0.0, 0.199]), np.array([0.0, 2.0]))
@@ -301,19 +303,19 @@ def test_a_tree_of_proposals_stops_where_every_node_has_terminated(make_agent):
     assert policy.last_result.chosen[0] >= 0 and policy.last_result.simulated_steps == 4
 
 
-def test_refinement_improves_and_keeps_its_spread():
-    one = SearchSettings(30, 3, strategy="refine", n_rounds=1, beam_noise=0.3)
-    many = SearchSettings(10, 3, strategy="refine", n_rounds=3, beam_noise=0.3)
+def test_the_cross_entropy_method_improves_and_keeps_its_spread():
+    one = CEMSettings(30, 3, n_rounds=1, beam_noise=0.3)
+    many = CEMSettings(10, 3, n_rounds=3, beam_noise=0.3)
     gains = [
         on_line(LineWorld(), many, seed).values.max(axis=1)
         - on_line(LineWorld(), one, seed).values.max(axis=1)
         for seed in range(20)
     ]
     assert np.mean(gains) > 0
-    collapsed = SearchSettings(4, 2, strategy="refine", n_rounds=2, n_elites=1, min_noise=1e-30)
+    collapsed = CEMSettings(4, 2, n_rounds=2, n_elites=1, min_noise=1e-30)
     rounds = on_line(LineWorld(), collapsed).candidates.reshape(len(ROOTS), 2, 4)
     assert (rounds[:, 1] == rounds[:, 1, :1]).all()
-    floor = SearchSettings(4, 2, strategy="refine", n_rounds=2, n_elites=1, min_noise=0.05)
+    floor = CEMSettings(4, 2, n_rounds=2, n_elites=1, min_noise=0.05)
     rounds = on_line(LineWorld(), floor).candidates.reshape(len(ROOTS), 2, 4)
     assert (rounds[:, 1].std(axis=1) > 0.01).all()
 
@@ -325,11 +327,12 @@ class Gusts(gym.ActionWrapper):
         return (action + self.np_random.normal(scale=0.1, size=action.shape)).astype(np.float32)
 
 
-@pytest.mark.parametrize("strategy", ["tree", "refine"])
+@pytest.mark.parametrize("strategy", ["tree", "cem"])
 def test_a_real_environment_with_random_dynamics(make_agent, strategy):
     agent = make_agent(rollout_depth=0, n_simulations=1)
     env = DummyVecEnv([lambda: Gusts(gym.make("Pendulum-v1"))])
-    settings = dict(strategy=strategy, beam_width=3, rollout_depth=2, branching=2, n_rounds=2, seed=0)
+    own = dict(branching=2) if strategy == "tree" else dict(n_rounds=2)
+    settings = dict(strategy=strategy, beam_width=3, rollout_depth=2, search_kwargs=own, seed=0)
     with pytest.raises(ValueError, match="n_simulations of 2 or more"):
         SearchPolicy(agent, env, n_simulations=1, **settings)
     policy = SearchPolicy(agent, env, n_simulations=3, **settings)

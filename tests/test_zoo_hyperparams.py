@@ -10,10 +10,10 @@ import yaml
 
 from sb3_mcbs.agents.hyperparameters import SETTINGS
 from sb3_mcbs.agents.registry import SEARCHING as ALGORITHMS
-from sb3_mcbs.search import SearchSettings
+from sb3_mcbs.search import make_settings
 from sb3_mcbs.zoo import hyperparams_path
 
-SEARCH_KEYS = {*(name for settings in SETTINGS for name in settings.names()), "env_wrapper"}
+SEARCH_KEYS = {*SETTINGS, "env_wrapper"}
 FAMILIES = [
     "Ant",
     "HalfCheetah",
@@ -59,7 +59,7 @@ def test_the_two_files_differ_only_in_the_search(mcbs: dict[str, Any], baseline:
 def test_every_entry_searches_and_is_wrapped_for_worker_processes(mcbs: dict[str, Any]) -> None:
     for env, entry in mcbs.items():
         assert entry["env_wrapper"] == "sb3_mcbs.SnapshotEnvWrapper", env
-        SearchSettings(
+        make_settings(
             **{key: entry[key] for key in ("beam_width", "rollout_depth", "n_simulations", "beam_noise")}
         )
 

@@ -1,6 +1,6 @@
 """Training through RL Zoo's command: hyperparameters found, both policies evaluated, nothing disturbed."""
 
-from dataclasses import fields
+import inspect
 from pathlib import Path
 from typing import Any
 
@@ -60,7 +60,7 @@ def test_another_preset_for_a_trained_agent(
         tmp_path / "logs" / "mcbs_td3" / "Pendulum-v1_1" / "Pendulum-v1.zip"
     ).search_settings
     strategy, width, simulations = settings.strategy, settings.beam_width, settings.n_simulations
-    expected = {"efficient": ("beam", 6, 1), "balanced": ("refine", 7, 1), "None": ("beam", 2, 1)}
+    expected = {"efficient": ("beam", 6, 1), "balanced": ("cem", 7, 1), "None": ("beam", 2, 1)}
     assert (strategy, width, simulations) == next(expected[name] for name in expected if name in words[0])
 
 
@@ -142,7 +142,7 @@ def test_evaluating_changes_nothing_in_training(
 def test_td3_evaluated_with_search_too_and_otherwise_unchanged(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    search = "search_evaluation:{'beam_width': 3, 'rollout_depth': 1, 'n_simulations': 1, 'n_threads': 1}"
+    search = "search_evaluation:dict(beam_width=3, rollout_depth=1, n_simulations=1)"
     zoo_train(monkeypatch, tmp_path, "td3", *SHORT, "-conf", "sb3_mcbs", "-params", *TINY, search)
     zoo_train(monkeypatch, tmp_path, "td3", *SHORT, "-conf", "sb3_mcbs", "-params", *TINY)
     with_evaluation, without = (tmp_path / "logs" / "td3" / f"Pendulum-v1_{number}" for number in (1, 2))
@@ -190,12 +190,24 @@ def test_nothing_is_said_of_the_xml_of_half_cheetah(
 def test_names_need_no_quotes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     names = ("preset:strong", "forward_model:pool", "noise_type:ornstein-uhlenbeck", "noise_std:0.2")
     classes = ("policy:MlpPolicy", "env_wrapper:sb3_mcbs.SnapshotEnvWrapper", "matmul_precision:None")
-    words = ("-n", "101", "--eval-freq", "-1", "-params", *TINY, "n_threads:1", *names, *classes)
+    words = (
+        "-n",
+        "101",
+        "--eval-freq",
+        "-1",
+        "-params",
+        *TINY,
+        "model_kwargs:dict(n_threads=1)",
+        *names,
+        *classes,
+    )
     zoo_train(monkeypatch, tmp_path, "mcbs_tqc", *words)
     config, _ = load_run(tmp_path / "logs" / "mcbs_tqc" / "Pendulum-v1_1")
     assert (config["preset"], config["policy"], config["matmul_precision"]) == ("strong", "MlpPolicy", None)
     agent = ALGORITHMS["mcbs_tqc"].load(tmp_path / "logs" / "mcbs_tqc" / "Pendulum-v1_1" / "Pendulum-v1.zip")
-    assert agent.search_settings == SearchSettings.preset("strong", n_threads=1, forward_model="pool")
+    assert agent.search_settings == SearchSettings.preset(
+        "strong", model_kwargs=dict(n_threads=1), forward_model="pool"
+    )
     assert "OrnsteinUhlenbeck" in repr(agent.action_noise)
 
 
@@ -205,7 +217,8 @@ def test_names_need_no_quotes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         ("preset:strng", "there is no such preset; known are paper, efficient, balanced, strong."),
         ("preset:'strng'", "there is no such preset; known are paper, efficient, balanced, strong."),
         ("search_unit:episodes", "there is no such search_unit; known are step, episode."),
-        ("include_policy_action:true", "must be a number, True, False or None."),
+        ("search_share:true", "must be a number, True, False or None."),
+        ("search_kwargs:antithetic", "must be a dictionary, such as dict(NAME=VALUE), or None."),
     ],
 )
 def test_a_misspelt_value_is_one_line(
@@ -217,8 +230,8 @@ def test_a_misspelt_value_is_one_line(
 
 
 def test_every_setting_that_is_a_name_is_known() -> None:
-    named = {field.name for settings in SETTINGS for field in fields(settings) if "str" in str(field.type)}
-    assert set(NAMES) == {"preset", *named}
+    parameters = inspect.signature(MCBSTD3).parameters
+    assert set(NAMES) == {name for name in SETTINGS if parameters[name].annotation in (str, str | None)}
 
 
 def test_no_file_of_this_package_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -239,11 +252,11 @@ def test_a_preset_of_the_command_line_goes_before_the_file(
         *TINY,
         "preset:'strong'",
         "beam_width:8",
-        "n_threads:1",
+        "model_kwargs:dict(n_threads=1)",
     )
     zoo_train(monkeypatch, tmp_path, algo, *words)
     agent = ALGORITHMS[algo].load(tmp_path / "logs" / algo / "Pendulum-v1_1" / "Pendulum-v1.zip")
-    settings = SearchSettings.preset("strong", beam_width=8, n_threads=1)
+    settings = SearchSettings.preset("strong", beam_width=8, model_kwargs=dict(n_threads=1))
     assert (agent.preset, agent.search_settings) == ("strong", settings)
 
 
@@ -265,11 +278,20 @@ def test_the_papers_preset_takes_noise_from_searched_actions(
 def test_a_preset_replaces_what_the_file_says_of_the_search(
     preset: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    words = ("-n", "101", "--eval-freq", "-1", "-params", *TINY, f"preset:'{preset}'", "n_threads:1")
+    words = (
+        "-n",
+        "101",
+        "--eval-freq",
+        "-1",
+        "-params",
+        *TINY,
+        f"preset:'{preset}'",
+        "model_kwargs:dict(n_threads=1)",
+    )
     zoo_train(monkeypatch, tmp_path, "mcbs_td3", *words, env="HalfCheetah-v5")
     folder = tmp_path / "logs" / "mcbs_td3" / "HalfCheetah-v5_1"
     agent = MCBSTD3.load(folder / "HalfCheetah-v5.zip")
-    assert agent.search_settings == SearchSettings.preset(preset, n_threads=1)
+    assert agent.search_settings == SearchSettings.preset(preset, model_kwargs=dict(n_threads=1))
     is_algorithm_1 = (agent.search_share, agent.search_unit, agent.value_expansion) == (1, "step", 0)
     assert is_algorithm_1 == (preset == "paper"), "the others leave it to the file when to search"
 

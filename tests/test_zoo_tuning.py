@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,8 +14,11 @@ import yaml
 from sb3_mcbs import SearchPolicy
 from sb3_mcbs.agents.hyperparameters import SETTINGS
 from sb3_mcbs.agents.registry import SEARCHING as ALGORITHMS
-from sb3_mcbs.search import SearchSettings, with_preset
+from sb3_mcbs.agents.schedule import ScheduleSettings
+from sb3_mcbs.agents.value_expansion import ValueExpansionSettings
+from sb3_mcbs.search import SearchSettings, make_settings, with_preset
 from sb3_mcbs.zoo import sampler, train
+from sb3_mcbs.zoo.manager import MCBSExperimentManager
 from sb3_mcbs.zoo.paths import hyperparams_path
 from tests.zoo_helpers import TINY, zoo_train
 
@@ -96,9 +100,9 @@ def test_schedules_are_tuned_when_asked(
         del params["final_share_factor"]
     sampled = sample(params)
     assert sampled == sampler.convert_mcbs_params(params)
-    assert sampled.get("final_search_share") == (None if schedule == "constant" else 0.1)
+    assert sampled["schedule_kwargs"] == ({} if schedule == "constant" else {"final_search_share": 0.1})
     agent = make_agent("InvertedPendulum-v5", **sampled)
-    assert {name: getattr(agent, name) for name in sampled} == sampled
+    assert {name: getattr(agent, name) or {} for name in sampled} == {n: v or {} for n, v in sampled.items()}
     with pytest.raises(optuna.TrialPruned, match="value_expansion needs a rollout_depth"):
         sample({**params, "rollout_depth": 0, "n_simulations": 1})
 
@@ -107,7 +111,7 @@ def search_settings(params: dict[str, Any]) -> SearchSettings:
     """What a trial searches with, whatever preset the hyperparameter file names."""
     file = {"preset": "strong"}
     params = {**file, **params}
-    return SearchSettings(**with_preset(params.pop("preset"), params))
+    return make_settings(**with_preset(params.pop("preset"), params))
 
 
 @pytest.mark.parametrize("base", BASES)
@@ -136,10 +140,11 @@ def test_strategies_are_tuned_when_asked(base: str, monkeypatch: pytest.MonkeyPa
 #: Settings that a file might hold.
 UNUSUAL = [
     ("strategy", "tree"),
-    ("strategy", "refine"),
-    ("n_elites", 2),
-    ("time_budget", 0.5),
-    ("noise_clip", 0.3),
+    ("strategy", "cem"),
+    ("search_kwargs", {"include_policy_action": True}),
+    ("search_kwargs", {"time_budget": 0.5}),
+    ("search_kwargs", {"noise_clip": 0.3}),
+    ("schedule_kwargs", {"saturation_window": 500}),
 ]
 
 
@@ -150,11 +155,12 @@ def test_trials_go_with_every_entry_of_the_files(
 ) -> None:
     """What a trial draws and what the file holds must make an agent together, or the study would end."""
     monkeypatch.setenv(sampler.SWITCH, scope)
-    names = {name for settings in SETTINGS for name in settings.names()}
-    entries = yaml.safe_load(hyperparams_path(algo).read_text())
-    kinds = {tuple(sorted((n, v) for n, v in entry.items() if n in names)) for entry in entries.values()}
-    kinds |= {(("rollout_depth", 3), more) for more in UNUSUAL}
-    for held in map(dict, kinds):
+    kinds: list[dict[str, Any]] = []
+    for entry in yaml.safe_load(hyperparams_path(algo).read_text()).values():
+        held = {name: value for name, value in entry.items() if name in SETTINGS}
+        kinds += [] if held in kinds else [held]
+    for held in [*kinds, *({"rollout_depth": 3, name: value} for name, value in UNUSUAL)]:
+        kwargs = held.get("search_kwargs", {})
         study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
         n_good = 0
         for _ in range(150):  # seldom so many: few go with a time budget
@@ -165,19 +171,46 @@ def test_trials_go_with_every_entry_of_the_files(
             except optuna.TrialPruned:
                 continue
             n_good += 1
-            merged = {name: value for name, value in {**held, **params}.items() if name in names}
-            search, schedule, expansion, _ = (
-                settings(**{name: merged[name] for name in settings.names() if name in merged})
-                for settings in SETTINGS
+            agent = SimpleNamespace(**{**SETTINGS, **held, **params})
+            search, schedule = SearchSettings.of(agent), ScheduleSettings.of(agent)
+            expansion = ValueExpansionSettings.of(agent)
+            assert search.noise_clip == kwargs.get("noise_clip"), "limits are held"
+            assert schedule.saturation_window == held.get("schedule_kwargs", {}).get(
+                "saturation_window", ScheduleSettings.saturation_window
             )
-            assert search.noise_clip == held.get("noise_clip"), "limits are held"
             schedule.check_search(search)
             expansion.check_search(search)
             if n_good == 10:
                 break
-        assert n_good >= (1 if "time_budget" in held else 10), held
-        simulations_differ = "rollout_noise" not in held and held.get("strategy", "beam") == "beam"
+        assert n_good >= (1 if "time_budget" in kwargs else 10), held
+        simulations_differ = "rollout_noise" not in kwargs and held.get("strategy", "beam") == "beam"
         assert ("n_simulations" in trial.params) == (scope == "strategies" or simulations_differ)
+
+
+def test_a_loaded_trial_searches_within_the_limits_that_it_was_drawn_in(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(sampler.SWITCH, "strategies")
+    file = str(tmp_path / "study.log")
+    backend = optuna.storages.journal.JournalFileBackend(file)
+    study = optuna.create_study(
+        storage=optuna.storages.JournalStorage(backend),
+        study_name="tiny",
+        sampler=optuna.samplers.RandomSampler(seed=0),
+    )
+    manager: Any = object.__new__(MCBSExperimentManager)
+    manager.algo = "mcbs_td3"
+    for _ in range(20):
+        trial = study.ask()
+        trial.set_user_attr(sampler.HELD, {"search_kwargs": {"noise_clip": 0.3, "rollout_noise": 0.2}})
+        try:
+            params = sampler.sample_mcbs_params("td3", trial, 6, 1, dict(NO_HER))
+        except optuna.TrialPruned:
+            continue
+        study.tell(trial, 0.0)
+        loaded = manager.load_trial(file, "tiny", trial.number)
+        assert loaded == params and loaded["search_kwargs"]["noise_clip"] == 0.3
+        assert loaded["search_kwargs"].get("rollout_noise") != 0.2
 
 
 def test_unknown_scope_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -212,7 +245,7 @@ def test_every_other_combination_is_accepted_by_the_constructor() -> None:
 
 WORDS = ["-optimize", "-n", "300", "--n-evaluations", "1", "--eval-episodes", "1", "--no-optim-plots",
          "--study-name", "tiny", "--storage", "study.log", "--num-threads", "1"]  # fmt: skip
-PARAMS = ["-params", *TINY, "n_threads:1"]
+PARAMS = ["-params", *TINY, "model_kwargs:dict(n_threads=1)"]
 
 
 def load_study(path: Path) -> optuna.Study:
@@ -238,7 +271,9 @@ def test_objective_is_the_actor_with_search(tmp_path: Path, monkeypatch: pytest.
     assert [trial.state.name for trial in study.trials] == ["COMPLETE"] * 2
     for trial in study.trials:
         assert trial.user_attrs["search/decisions"] == 200
-        assert trial.user_attrs[sampler.HELD]["n_threads"] == 1, "what the file and -params say of the search"
+        assert trial.user_attrs[sampler.HELD]["model_kwargs"] == {"n_threads": 1}, (
+            "what the file and -params say of the search"
+        )
         assert trial.user_attrs["search/simulated_steps"] == 400
         assert np.isfinite(trial.value)
     assert len(list((tmp_path / "logs" / "mcbs_td3").glob("report_*.csv"))) == 1

@@ -10,7 +10,7 @@ import torch as th
 from stable_baselines3.common.monitor import load_results
 
 TINY = ["learning_starts:100", "policy_kwargs:dict(net_arch=[16])", "batch_size:16"]
-TINY_SEARCH = [*TINY, "beam_width:2", "rollout_depth:1", "n_simulations:1", "n_threads:1"]
+TINY_SEARCH = [*TINY, "beam_width:2", "rollout_depth:1", "n_simulations:1", "model_kwargs:dict(n_threads=1)"]
 
 
 def zoo_train(

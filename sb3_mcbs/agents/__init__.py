@@ -1,5 +1,6 @@
 """Agents of Stable-Baselines3 that search before they act, and acting with search with any of its agents."""
 
+from sb3_mcbs.agents.learned_model import EnsembleSettings
 from sb3_mcbs.agents.mcbs import MCBS
 from sb3_mcbs.agents.mcbs_ddpg import MCBSDDPG
 from sb3_mcbs.agents.mcbs_sac import MCBSSAC
@@ -8,4 +9,13 @@ from sb3_mcbs.agents.mcbs_tqc import MCBSTQC
 from sb3_mcbs.agents.schedule import ScheduleSettings
 from sb3_mcbs.agents.search_policy import SearchPolicy
 
-__all__ = ["MCBS", "MCBSDDPG", "MCBSSAC", "MCBSTD3", "MCBSTQC", "ScheduleSettings", "SearchPolicy"]
+__all__ = [
+    "MCBS",
+    "MCBSDDPG",
+    "MCBSSAC",
+    "MCBSTD3",
+    "MCBSTQC",
+    "EnsembleSettings",
+    "ScheduleSettings",
+    "SearchPolicy",
+]

@@ -1,70 +1,60 @@
 """The settings of the search as attributes of an agent: checked, and changed while it learns."""
 
+from copy import deepcopy
 from typing import Any
 
-from sb3_mcbs.agents.hyperparameters import REMOVED, SETTING_NAMES, refuse_removed, settings_of_preset
+from sb3_mcbs.agents.hyperparameters import (
+    GROUPS,
+    MOVED,
+    REMOVED,
+    SETTINGS,
+    RefusesOldNames,
+    refuse_old_names,
+    settings_of_preset,
+    tidied,
+)
 from sb3_mcbs.agents.schedule import ScheduleSettings
-from sb3_mcbs.search import SearchSettings
-from sb3_mcbs.search.checks import CheckedSettings
-
-_CHECKED = SETTING_NAMES | {"preset", "action_noise_after_search"}
+from sb3_mcbs.search import SearchSettings, with_preset
 
 
-class SearchAttributes:
-    """The fields of :data:`~sb3_mcbs.agents.hyperparameters.SETTINGS` as attributes of an agent.
+class SearchAttributes(RefusesOldNames):
+    """:data:`~sb3_mcbs.agents.hyperparameters.SETTINGS` as attributes of an agent.
 
     Once the agent is set up, they are checked when they are set, together with all others, and hold from the
     next decision on::
 
         agent.beam_width = 20
-        agent.search_settings = replace(agent.search_settings, strategy="tree", branching=3)
+        agent.search_kwargs = {"antithetic": True}
+        agent.search_settings = TreeSettings(beam_width=4, branching=3)
         agent.preset = "balanced"
+
+    ``agent.search_kwargs["antithetic"] = True`` is noticed, and checked, at the next decision.
     """
 
-    preset: str | None
-    action_noise_after_search: bool
     beam_width: int
     rollout_depth: int
     n_simulations: int
     beam_noise: float
-    rollout_noise: float | None
-    noise_clip: float | None
-    include_policy_action: bool
-    n_threads: int
-    forward_model: str
-    matmul_precision: str | None
-    time_budget: float | None
-    max_beam_width: int | None
     strategy: str
-    n_proposals: int | None
-    antithetic: bool
-    branching: int
-    n_rounds: int
-    n_elites: int | None
-    min_noise: float
-    noise_hold: int
-    proposal_dims: int | None
+    search_kwargs: dict[str, Any] | None
+    preset: str | None
     search_schedule: str
     search_share: float
     search_unit: str
-    final_search_share: float | None
-    final_beam_width: int | None
-    final_rollout_depth: int | None
-    saturation_window: int
-    saturation_tolerance: float
-    recovery_tolerance: float
+    schedule_kwargs: dict[str, Any] | None
+    forward_model: str
+    model_kwargs: dict[str, Any] | None
     value_expansion: int
     expanded_share: float
-    ensemble_size: int
-    ensemble_train_freq: int
-    ensemble_gradient_steps: int
-    ensemble_max_error: float
-    ensemble_pessimism: float
+    action_noise_after_search: bool
+    matmul_precision: str | None
+    #: What the dictionaries contained when they were last checked.
+    _followed: list[dict[str, Any] | None]
 
     def __setattr__(self, name: str, value: Any) -> None:
-        if name in REMOVED:
-            refuse_removed([name])
-        if name not in _CHECKED or not self._is_set_up:
+        if name in REMOVED or name in MOVED:
+            refuse_old_names({name: value})
+        if name not in SETTINGS or not self._is_set_up:
             super().__setattr__(name, value)
         elif hasattr(type(self), name):  # a property of a class of the user's
             super().__setattr__(name, value)
@@ -81,7 +71,12 @@ class SearchAttributes:
 
     @search_settings.setter
     def search_settings(self, settings: SearchSettings) -> None:
-        self._replace_settings(SearchSettings, settings)
+        if not isinstance(settings, SearchSettings):
+            raise TypeError(f"Expected BeamSettings, TreeSettings or CEMSettings, got {settings!r}.")
+        changes = settings.grouped()
+        learned = {key: value for key, value in (self.model_kwargs or {}).items() if key != "n_threads"}
+        changes["model_kwargs"] = {**learned, **(changes["model_kwargs"] or {})} or None
+        self._change_settings(changes)
 
     @property
     def schedule_settings(self) -> ScheduleSettings:
@@ -90,12 +85,9 @@ class SearchAttributes:
 
     @schedule_settings.setter
     def schedule_settings(self, settings: ScheduleSettings) -> None:
-        self._replace_settings(ScheduleSettings, settings)
-
-    def _replace_settings(self, cls: type[CheckedSettings], settings: Any) -> None:
-        if type(settings) is not cls:
-            raise TypeError(f"Expected {cls.__name__}, got {settings!r}.")
-        self._change_settings({name: getattr(settings, name) for name in settings.names()})
+        if not isinstance(settings, ScheduleSettings):
+            raise TypeError(f"Expected ScheduleSettings, got {settings!r}.")
+        self._change_settings(settings.grouped())
 
     def _change_settings(self, changes: dict[str, Any]) -> None:
         """Change settings and have everything follow, or leave all as it was.
@@ -105,6 +97,7 @@ class SearchAttributes:
         :raises ValueError: if a value is out of range or does not go with the others.
         """
         attributes = vars(self)
+        changes = tidied(changes)
         before = {name: attributes[name] for name in changes if name in attributes}
         attributes.update(changes)
         try:
@@ -115,6 +108,19 @@ class SearchAttributes:
             attributes.update(before)
             self._follow_settings()
             raise
+
+    def _note_dictionaries(self) -> None:
+        """Remember what the dictionaries contain, which was checked."""
+        vars(self)["_followed"] = deepcopy([getattr(self, group) for group in GROUPS])
+        own = {"strategy": self.strategy, "search_kwargs": self.search_kwargs}
+        if with_preset(self.preset, own) != {**with_preset(self.preset, {}), **own}:
+            # An agent that is made with the same arguments would have what was taken from the preset.
+            vars(self)["preset"] = None
+
+    def _follow_dictionaries(self) -> None:
+        """Follow what was changed within the dictionaries since they were last checked."""
+        if [getattr(self, group) for group in GROUPS] != self._followed:
+            self._follow_settings()
 
     @property
     def _is_set_up(self) -> bool:

@@ -1,25 +1,40 @@
 """The settings of the search, and of what is learned from it, as parameters of constructors."""
 
-import inspect
-from collections.abc import Iterable, Mapping
-from dataclasses import Field, asdict, fields
-from typing import Any, TypedDict
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any, Self
 
 from sb3_mcbs.agents.learned_model import EnsembleSettings
 from sb3_mcbs.agents.schedule import ScheduleSettings
 from sb3_mcbs.agents.value_expansion import ValueExpansionSettings
-from sb3_mcbs.search import SearchSettings, with_preset
-from sb3_mcbs.search.checks import CheckedSettings
-from sb3_mcbs.search.settings import OF_THE_MACHINE
+from sb3_mcbs.search import BeamSettings, make_settings, with_preset
+from sb3_mcbs.search.checks import as_dict
+from sb3_mcbs.search.settings import OF_THE_MACHINE, STRATEGIES, present_name
 
-#: What an agent's constructor takes besides SB3's parameters, as attributes of the same names.
-SETTINGS: tuple[type[CheckedSettings], ...] = (
-    SearchSettings,
-    ScheduleSettings,
-    ValueExpansionSettings,
-    EnsembleSettings,
-)
-SETTING_NAMES = frozenset(name for settings in SETTINGS for name in settings.names())
+#: What an agent's constructor takes besides SB3's parameters, as attributes of the same names: the defaults
+#: without a preset. ``None`` is a dictionary without keys.
+SETTINGS: dict[str, Any] = {
+    "beam_width": 6,
+    "rollout_depth": 3,
+    "n_simulations": 5,
+    "beam_noise": 0.1,
+    "strategy": "beam",
+    "search_kwargs": None,
+    "preset": None,
+    "search_schedule": "constant",
+    "search_share": 1.0,
+    "search_unit": "step",
+    "schedule_kwargs": None,
+    "forward_model": "auto",
+    "model_kwargs": None,
+    "value_expansion": 0,
+    "expanded_share": 0.5,
+    "action_noise_after_search": False,
+    "matmul_precision": None,
+}
+GROUPS = ("search_kwargs", "schedule_kwargs", "model_kwargs")
+#: What a preset may say: ``None`` in the signature of a constructor, since any number may have been given.
+_OF_PRESETS = ("beam_width", "rollout_depth", "n_simulations", "beam_noise", "strategy")
 
 #: Settings that there once were: what their default was, and what there is instead.
 REMOVED: dict[str, tuple[Any, str]] = {
@@ -29,116 +44,81 @@ REMOVED: dict[str, tuple[Any, str]] = {
     "common_noise": (False, "the later actions of every rollout have noise of their own; see antithetic"),
     "one_node_per_root": (False, "a tree keeps its best nodes, whichever root action they grew from"),
 }
-
-_SEARCH_SETTINGS = "search_settings"
-
-
-class SearchKeywords(TypedDict, total=False):
-    """The fields of :data:`SETTINGS` as keyword arguments, for type checkers."""
-
-    beam_width: int
-    rollout_depth: int
-    n_simulations: int
-    beam_noise: float
-    rollout_noise: float | None
-    noise_clip: float | None
-    include_policy_action: bool
-    n_threads: int
-    forward_model: str
-    matmul_precision: str | None
-    time_budget: float | None
-    max_beam_width: int | None
-    strategy: str
-    n_proposals: int | None
-    antithetic: bool
-    branching: int
-    n_rounds: int
-    n_elites: int | None
-    min_noise: float
-    noise_hold: int
-    proposal_dims: int | None
-    search_schedule: str
-    search_share: float
-    search_unit: str
-    final_search_share: float | None
-    final_beam_width: int | None
-    final_rollout_depth: int | None
-    saturation_window: int
-    saturation_tolerance: float
-    recovery_tolerance: float
-    value_expansion: int
-    expanded_share: float
-    ensemble_size: int
-    ensemble_train_freq: int
-    ensemble_gradient_steps: int
-    ensemble_max_error: float
-    ensemble_pessimism: float
+#: Settings that once were keywords themselves, and what they are part of now.
+MOVED: dict[str, str] = {
+    **dict.fromkeys(("rollout_noise", "noise_clip", "include_policy_action", "n_proposals"), "search_kwargs"),
+    **dict.fromkeys(("antithetic", "noise_hold", "proposal_dims", "time_budget"), "search_kwargs"),
+    **dict.fromkeys(("max_beam_width", "branching", "n_rounds", "n_elites", "min_noise"), "search_kwargs"),
+    **dict.fromkeys(("final_search_share", "final_beam_width", "final_rollout_depth"), "schedule_kwargs"),
+    **dict.fromkeys(("saturation_window", "saturation_tolerance", "recovery_tolerance"), "schedule_kwargs"),
+    **dict.fromkeys(("n_threads", "ensemble_size", "ensemble_train_freq"), "model_kwargs"),
+    **dict.fromkeys(("ensemble_gradient_steps", "ensemble_max_error", "ensemble_pessimism"), "model_kwargs"),
+}
 
 
-def list_search_settings(cls: type) -> None:
-    """Put the search settings one by one where the constructor has them as ``**search_settings``.
+class RefusesOldNames:
+    """Says where a setting went that is given to the constructor as it once was."""
 
-    ``help``, :mod:`inspect` and exact checkpoints then see them like SB3's own parameters.
-
-    :param cls: changed in place; nothing is done for a class without that parameter.
-    """
-    init: Any = cls.__dict__.get("__init__")
-    signature = None if init is None else inspect.signature(init)
-    if signature is None or _SEARCH_SETTINGS not in signature.parameters:
-        return
-    listed = [
-        inspect.Parameter(
-            field.name, inspect.Parameter.KEYWORD_ONLY, default=field.default, annotation=field.type
-        )
-        for field in setting_fields()
-    ]
-    *others, _ = signature.parameters.values()
-    init.__signature__ = signature.replace(parameters=[*others, *listed])
-    if cls.__doc__:  # there is none under ``python -OO``
-        before, _, _ = inspect.cleandoc(cls.__doc__).partition(f":param {_SEARCH_SETTINGS}:")
-        cls.__doc__ = before + "".join(_parameters_documented(settings) for settings in SETTINGS)
+    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
+        refuse_old_names(kwargs)
+        return super().__new__(cls)
 
 
-def complete_settings(
-    cls_name: str, given: Mapping[str, object], preset: str | None = None
-) -> dict[str, object]:
+def complete_settings(arguments: Mapping[str, Any]) -> dict[str, Any]:
     """All settings of an agent.
 
-    :param cls_name: of the agent, for errors.
-    :param given: those that its constructor was given.
-    :param preset: where the others start from, see :func:`~sb3_mcbs.search.with_preset`.
-    :return: the value of every field of :data:`SETTINGS`.
-    :raises TypeError: if there is no such setting.
+    :param arguments: of its constructor, SB3's among them.
+    :return: the value of each of :data:`SETTINGS`.
+    :raises TypeError: if settings that should be a dictionary are none.
     :raises ValueError: if there is no such preset.
     """
-    refuse_removed(given)
-    known = {field.name: field.default for field in setting_fields()}
-    unknown = sorted(given.keys() - known.keys())
-    if unknown:
-        raise TypeError(
-            f"{cls_name} got unexpected keyword arguments {unknown}; the settings of the search are "
-            f"{list(known)}."
-        )
-    return {**known, **with_preset(preset, given)}
+    given = {name: value for name, value in arguments.items() if name in SETTINGS}
+    for name in _OF_PRESETS:
+        if given.get(name) is None:
+            given.pop(name, None)
+    return tidied({**SETTINGS, **with_preset(given.get("preset"), given)})
 
 
-def refuse_removed(names: Iterable[str]) -> None:
-    """Refuse settings that there once were.
+def tidied(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings as an agent keeps them.
 
-    :param names: of settings.
+    :param settings: by name.
+    :return: the same with copies of dictionaries, and a strategy's present name.
+    :raises TypeError: if settings that should be a dictionary are none.
+    """
+    kept = dict(settings)
+    for group in GROUPS:
+        if kept.get(group) is not None:
+            kept[group] = as_dict(group, kept[group]) or None
+    if "strategy" in kept:
+        kept["strategy"] = present_name(kept["strategy"])
+    return kept
+
+
+def refuse_old_names(names: Mapping[str, Any]) -> None:
+    """Refuse settings that were removed, or are part of others now.
+
+    :param names: settings by name.
     :raises TypeError: names them, and says what there is instead.
     """
-    found = [f"{name} was removed: {REMOVED[name][1]}" for name in names if name in REMOVED]
-    if found:
-        raise TypeError("; ".join(found) + ". Leave it out.")
+    removed = [f"{name} was removed: {REMOVED[name][1]}" for name in names if name in REMOVED]
+    if removed:
+        raise TypeError("; ".join(removed) + ". Leave it out.")
+    for group in GROUPS:
+        moved = {name: value for name, value in names.items() if MOVED.get(name) == group}
+        if moved:
+            verb = "is" if len(moved) == 1 else "are"
+            raise TypeError(f"{', '.join(moved)} {verb} now part of {group}: write {group}={moved!r}.")
 
 
-def drop_removed(attributes: dict[str, Any]) -> None:
-    """Take removed settings with their defaults, which changed nothing, off an agent of an older file.
+def convert_older(agent: Any) -> None:
+    """Give an agent of an older file the settings that there are now.
 
-    :param attributes: of the agent; changed.
-    :raises TypeError: if one has another value.
+    :param agent: whose attributes have just been loaded. Removed ones with their defaults, which changed
+        nothing, are taken off.
+    :raises TypeError: if a removed one has another value than its default.
     """
+    attributes = vars(agent)
     for name, (default, reason) in REMOVED.items():
         if attributes.get(name, default) != default:
             raise TypeError(
@@ -146,6 +126,34 @@ def drop_removed(attributes: dict[str, Any]) -> None:
                 f"on without it: load(..., custom_objects={{{name!r}: {default!r}}})."
             )
         attributes.pop(name, None)
+    group_flat(attributes)
+    for name, default in SETTINGS.items():
+        # An agent that was saved before a setting existed searches as if it had its default.
+        if not hasattr(agent, name):
+            attributes[name] = default
+
+
+def group_flat(attributes: dict[str, Any]) -> None:
+    """Put settings that are part of others now where they belong.
+
+    :param attributes: of an agent of an older file; changed. What was another strategy's or forward model's
+        changed nothing, and is left out.
+    """
+    strategy = attributes.get("strategy")
+    if isinstance(strategy, str) and strategy == "refine":
+        attributes["strategy"] = strategy = "cem"
+    cls = STRATEGIES.get(strategy, BeamSettings) if isinstance(strategy, str) else BeamSettings
+    defaults = {f.name: f.default for each in (cls, ScheduleSettings, EnsembleSettings) for f in fields(each)}
+    if attributes.get("forward_model") != "ensemble":
+        defaults = {name: value for name, value in defaults.items() if not name.startswith("ensemble_")}
+    found: dict[str, dict[str, Any]] = {}
+    for name in MOVED.keys() & attributes.keys():
+        value = attributes.pop(name)
+        if name in defaults and value != defaults[name]:
+            found.setdefault(MOVED[name], {})[name] = value
+    for group, values in found.items():
+        if attributes.get(group) is None:  # else it was given when loading
+            attributes[group] = values
 
 
 def settings_of_preset(name: str) -> dict[str, Any]:
@@ -156,22 +164,11 @@ def settings_of_preset(name: str) -> dict[str, Any]:
         of when is searched, what is learned from simulations and whether searched actions get noise.
     :raises ValueError: if there is no such preset.
     """
-    settings = asdict(SearchSettings.preset(name))
+    settings = make_settings(**with_preset(name, {})).grouped()
     for setting in OF_THE_MACHINE:
         del settings[setting]
     if name == "paper":
         for defaults in (ScheduleSettings(), ValueExpansionSettings()):
-            settings |= asdict(defaults)
+            settings |= defaults.grouped()
         settings["action_noise_after_search"] = False
     return settings
-
-
-def setting_fields() -> list[Field]:
-    """The fields of :data:`SETTINGS`."""
-    return [field for settings in SETTINGS for field in fields(settings)]
-
-
-def _parameters_documented(cls: type) -> str:
-    """The lines of a class's docstring that are about its parameters."""
-    _, first, after = inspect.cleandoc(cls.__doc__ or "").partition(":param ")
-    return first + after.partition(":raises ")[0]

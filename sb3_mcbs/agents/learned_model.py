@@ -1,7 +1,7 @@
 """The model that an agent learns of its environment while it trains."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from gymnasium import spaces
@@ -11,7 +11,7 @@ from stable_baselines3.common.preprocessing import get_action_dim
 
 from sb3_mcbs.models.ensemble import Ensemble, Transitions
 from sb3_mcbs.models.ensemble_model import check_observation_space
-from sb3_mcbs.search.checks import CheckedSettings
+from sb3_mcbs.search.checks import CheckedSettings, known_keys
 from sb3_mcbs.search.random_streams import spawn_rng
 
 #: One row of the replay buffer in so many is held out: always the last of them, so that a transition that was
@@ -23,7 +23,8 @@ LEAST_TRANSITIONS = 500
 
 @dataclass(frozen=True)
 class EnsembleSettings(CheckedSettings):
-    """What an agent learns a model of its environment with; used with ``forward_model="ensemble"``.
+    """What an agent learns a model of its environment with: in ``model_kwargs``, beside ``n_threads``, with
+    ``forward_model="ensemble"``.
 
     :param ensemble_size: networks in the model.
     :param ensemble_train_freq: environment steps between two fits of the model.
@@ -39,6 +40,8 @@ class EnsembleSettings(CheckedSettings):
     :raises ValueError: if a value is out of range.
     """
 
+    group = "model_kwargs"
+
     ensemble_size: int = 5
     ensemble_train_freq: int = 1000
     ensemble_gradient_steps: int = 500
@@ -52,6 +55,22 @@ class EnsembleSettings(CheckedSettings):
         self._set_integer("ensemble_gradient_steps", 1, 10**6)
         for name in ("ensemble_max_error", "ensemble_pessimism"):
             self._set_number(name, 1e6)
+
+    @classmethod
+    def of(cls, agent: Any) -> Self:
+        """Read the settings that an agent carries in ``model_kwargs``.
+
+        :param agent: an :class:`~sb3_mcbs.MCBS` agent.
+        :return: the checked settings; the defaults without a learned model.
+        :raises TypeError: if a value has the wrong type, or a key is not known.
+        :raises ValueError: if a value is out of range.
+        """
+        known = ("n_threads", *(cls.in_group() if agent.forward_model == "ensemble" else ()))
+        others = dict.fromkeys(cls.in_group(), "is for forward_model='ensemble'")
+        chosen = f"forward_model={agent.forward_model!r}"
+        given = known_keys("model_kwargs", agent.model_kwargs, known, chosen, others)
+        given.pop("n_threads", None)
+        return cls(**given)
 
 
 class LearnedModel:
@@ -152,12 +171,12 @@ def check_learned_model(agent: Any) -> None:
     :param agent: an :class:`~sb3_mcbs.MCBS` agent that was set up.
     :raises ValueError: if a setting is wrong, or does not fit.
     """
-    settings = EnsembleSettings.of(agent)
     if (agent.forward_model == "ensemble") != (agent.learned_model is not None):
         raise ValueError(
             "Whether an agent learns a model (forward_model='ensemble') is decided when it is made or "
-            "loaded: save it, and load it with another forward_model."
+            "loaded: save it, and load it with another forward_model, and the model_kwargs of that."
         )
+    settings = EnsembleSettings.of(agent)
     if agent.learned_model is not None:
         agent.learned_model.check(agent, settings)
 

@@ -17,11 +17,14 @@ from sb3_mcbs.agents.checked_rollouts import CheckedRollouts
 from sb3_mcbs.agents.exploration import DrawnNoise, noise_without_search
 from sb3_mcbs.agents.faults import environment_named
 from sb3_mcbs.agents.hyperparameters import (
+    GROUPS,
+    MOVED,
+    SETTINGS,
     complete_settings,
-    drop_removed,
-    list_search_settings,
-    refuse_removed,
+    convert_older,
+    refuse_old_names,
     settings_of_preset,
+    tidied,
 )
 from sb3_mcbs.agents.learned_model import (
     EnsembleSettings,
@@ -40,8 +43,9 @@ from sb3_mcbs.agents.value_expansion import (
     expand,
 )
 from sb3_mcbs.networks.torch_settings import matmul_precision
-from sb3_mcbs.search import FirstStep, RecentActions, SearchResult, SearchSettings
+from sb3_mcbs.search import BeamSettings, FirstStep, RecentActions, SearchResult, SearchSettings
 from sb3_mcbs.search.random_streams import spawn_rng
+from sb3_mcbs.search.settings import merged
 from sb3_mcbs.types import take_rows
 
 SelfMCBS = TypeVar("SelfMCBS", bound="MCBS")
@@ -54,14 +58,14 @@ class MCBS(SearchAttributes, Searching, Resumable, CheckedRollouts):
     ::
 
         class MCBSSAC(MCBS, SAC):
-            def __init__(self, policy, env, ..., **search_settings: Unpack[SearchKeywords]) -> None:
+            def __init__(self, policy, env, ..., *, beam_width: int | None = None, ...) -> None:
                 super().__init__(policy, env, ..., _init_setup_model=False)
-                self._init_search(action_noise_after_search, search_settings, preset)
+                self._init_search(locals())
                 if _init_setup_model:
                     self._setup_model()
 
-    A subclass keeps every search setting as an attribute, as SB3 does with its own. In the signature and the
-    docstring of such a class the settings are listed one by one where ``search_settings`` was written.
+    A subclass lists :data:`~sb3_mcbs.agents.hyperparameters.SETTINGS` in its signature, and keeps them as
+    attributes, as SB3 does with its own.
     """
 
     #: What neither ``save`` nor an exact checkpoint contains, and why.
@@ -70,32 +74,23 @@ class MCBS(SearchAttributes, Searching, Resumable, CheckedRollouts):
         "_prediction": "of the last step; made anew before it is read",
         "_states": "of the last step; made anew before it is read",
         "_checked_env": "a view of the environment",
+        "_followed": "copies of settings",
     }
     #: Set by ``sb3_mcbs.checkpoints``, which knows the agents, and not the other way round.
     _resume_as: ClassVar[Callable[..., Any]]
     _seed_at_setup: int | None = None
     _is_restored = False
 
-    def __init_subclass__(cls, **kwargs: Any) -> None:
-        super().__init_subclass__(**kwargs)
-        list_search_settings(cls)
-
-    def _init_search(
-        self, action_noise_after_search: bool, settings: Mapping[str, object], preset: str | None = None
-    ) -> None:
+    def _init_search(self, arguments: Mapping[str, Any]) -> None:
         """
         Take over the constructor's arguments for the search.
 
-        :param action_noise_after_search: add ``action_noise`` to searched actions too
-        :param settings: fields of :data:`SETTINGS`; those not given are the preset's, or the defaults
-        :param preset: see :func:`~sb3_mcbs.search.with_preset`
-        :raises TypeError: if there is no such setting
+        :param arguments: all of the constructor's, ``locals()``
+        :raises TypeError: if settings that should be a dictionary are none
         :raises ValueError: if there is no such preset
         """
-        for name, value in complete_settings(type(self).__name__, settings, preset).items():
+        for name, value in complete_settings(arguments).items():
             setattr(self, name, value)
-        self.preset = preset
-        self.action_noise_after_search = action_noise_after_search
 
         self.search_rng: np.random.Generator | None = None
         self._schedule: SearchSchedule | None = None
@@ -125,7 +120,8 @@ class MCBS(SearchAttributes, Searching, Resumable, CheckedRollouts):
 
     def _setup_model(self) -> None:
         # ``load`` sets attributes without calling the constructor, so settings are checked here.
-        drop_removed(vars(self))
+        convert_older(self)
+        vars(self).update(tidied({name: value for name, value in vars(self).items() if name in SETTINGS}))
         settings, schedule = self._checked_settings()
         # ``load`` seeds once more; generators that it has restored go on instead.
         self._is_restored = self.search_rng is not None and self._seed_at_setup == self.seed
@@ -143,6 +139,7 @@ class MCBS(SearchAttributes, Searching, Resumable, CheckedRollouts):
         set_up_learned_model(self)
         if self.env is not None:
             self._make_planner(self.env, settings)
+        self._note_dictionaries()
 
     @property
     def _is_set_up(self) -> bool:
@@ -165,6 +162,7 @@ class MCBS(SearchAttributes, Searching, Resumable, CheckedRollouts):
         self._schedule.settings = schedule
         if self.env is not None:
             self._explore_where_not_searched()
+        self._note_dictionaries()
 
     def _check_expansion(self) -> None:
         expansion = ValueExpansionSettings.of(self)
@@ -221,7 +219,7 @@ class MCBS(SearchAttributes, Searching, Resumable, CheckedRollouts):
         # As with SB3's agents, networks and environments are those of the original. Settings are not.
         made = type(self).__new__(type(self))
         vars(made).update(vars(self))
-        for name in ("_schedule", "planner"):
+        for name in ("_schedule", "planner", *GROUPS):
             vars(made)[name] = copy(vars(self)[name])
         if made.planner is not None:
             made.planner.agent = made
@@ -256,6 +254,7 @@ class MCBS(SearchAttributes, Searching, Resumable, CheckedRollouts):
         :return: actions ``[n_envs, *act_shape]`` to take in the environment
             and scaled actions that will be stored in the replay buffer.
         """
+        self._follow_dictionaries()
         self._prediction = None
         self._states = batched_states(self) if self.value_expansion else None
         self._check_noise_after_search()
@@ -407,7 +406,7 @@ class MCBS(SearchAttributes, Searching, Resumable, CheckedRollouts):
             self.logger.record_mean("search/value_gain", float((best - values.mean(axis=1)).mean()))
             self.logger.record_mean("search/beam_std", float(values.std(axis=1).mean()))
         self.logger.record_mean("search/ms_per_decision", 1000 * seconds / n_envs)
-        if self.time_budget is not None:
+        if isinstance(effort, BeamSettings) and effort.time_budget is not None:
             self.logger.record_mean("search/rounds", result.rounds)
             self.logger.record_mean("search/candidates", result.values.shape[1])
         if result.surviving_roots is not None:
@@ -460,10 +459,13 @@ class MCBS(SearchAttributes, Searching, Resumable, CheckedRollouts):
             is searched, except for settings beside it
         :return: the model
         """
-        refuse_removed(kwargs)
-        preset = kwargs.get("preset", (kwargs.get("custom_objects") or {}).get("preset"))
+        objects = kwargs.get("custom_objects") or {}
+        refuse_old_names({**{name: objects[name] for name in MOVED.keys() & objects.keys()}, **kwargs})
+        preset = kwargs.get("preset", objects.get("preset"))
         if preset is not None:
-            kwargs = {**settings_of_preset(preset), **kwargs}
+            kwargs = merged(settings_of_preset(preset), kwargs)
+        # An older file has what these contain as attributes, which None would leave.
+        kwargs = {name: {} if name in GROUPS and value is None else value for name, value in kwargs.items()}
         return super().load(path, *args, **kwargs)
 
     @classmethod

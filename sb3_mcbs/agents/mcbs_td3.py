@@ -1,6 +1,6 @@
 """TD3 that looks ahead before it acts."""
 
-from typing import Any, Unpack
+from typing import Any
 
 import torch as th
 from stable_baselines3 import TD3
@@ -9,7 +9,6 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.td3.policies import TD3Policy
 
-from sb3_mcbs.agents.hyperparameters import SearchKeywords
 from sb3_mcbs.agents.mcbs import MCBS
 from sb3_mcbs.networks.td3_update import FastUpdate
 
@@ -30,43 +29,39 @@ class MCBSTD3(MCBS, FastUpdate, TD3):
     What is simulated needs environments in :class:`~sb3_mcbs.SnapshotEnvWrapper`: the algorithm wraps them
     itself, except in a ``SubprocVecEnv``, where they must be wrapped when they are made.
 
-    :param policy: The policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy)
-    :param env: The environment to learn from (if registered in Gymnasium, can be str)
-    :param learning_rate: learning rate for the Adam optimizers, a constant or a function of the remaining
-        progress (from 1 to 0)
-    :param buffer_size: size of the replay buffer
+    The parameters before ``beam_width`` are those of :class:`~stable_baselines3.TD3`. What there is to
+    say of them here:
+
     :param learning_starts: how many steps of the model to collect transitions for before learning, and
         searching, starts
-    :param batch_size: Minibatch size for each gradient update
-    :param tau: the soft update coefficient ("Polyak update", between 0 and 1)
     :param gamma: the discount factor, of the critics and of the rollouts
-    :param train_freq: Update the model every ``train_freq`` steps, or a tuple like ``(5, "step")`` or
-        ``(2, "episode")``
-    :param gradient_steps: How many gradient steps to do after each rollout; -1 means as many as steps done
     :param action_noise: noise on actions chosen without search (before ``learning_starts`` and where
         the schedule leaves the search out). Searched actions are executed as they are unless
         ``action_noise_after_search`` is set.
-    :param replay_buffer_class: Replay buffer class to use (for instance ``HerReplayBuffer``)
-    :param replay_buffer_kwargs: Keyword arguments to pass to the replay buffer on creation
-    :param optimize_memory_usage: Enable a memory efficient variant of the replay buffer
-    :param n_steps: number of steps of n-step returns in the critic's target
-    :param policy_delay: Policy and target networks will only be updated once every policy_delay steps
-    :param target_policy_noise: Standard deviation of Gaussian noise added to target policy
-    :param target_noise_clip: Limit for absolute value of target policy smoothing noise
-    :param stats_window_size: Window size for the rollout logging, in episodes
-    :param tensorboard_log: the log location for tensorboard (if None, no logging)
-    :param policy_kwargs: additional arguments to be passed to the policy on creation
-    :param verbose: Verbosity level: 0 for no output, 1 for info messages, 2 for debug messages
     :param seed: Seed for the pseudo random generators, the search's own included
     :param device: Device (cpu, cuda, ...) on which the networks run; simulation is on the CPU
-    :param _init_setup_model: Whether or not to build the network at the creation of the instance
+    :param beam_width: number of candidate actions per decision (None: the preset's, or 6)
+    :param rollout_depth: simulated steps per rollout; 0 ranks by the critics alone (None: the preset's, or 3)
+    :param n_simulations: rollouts per candidate (None: the preset's, or 5)
+    :param beam_noise: spread of the candidates, in scaled actions (None: the preset's, or 0.1)
+    :param strategy: ``"beam"``, ``"tree"`` or ``"cem"`` (None: the preset's, or ``"beam"``)
+    :param search_kwargs: additional settings of the strategy, see :class:`~sb3_mcbs.BeamSettings`,
+        :class:`~sb3_mcbs.TreeSettings` and :class:`~sb3_mcbs.CEMSettings`
+    :param preset: a name of :data:`~sb3_mcbs.search.PRESETS`: where the settings of the search start from
+    :param search_schedule: when to search: ``"constant"``, ``"saturation"`` or ``"anneal"``
+    :param search_share: the share of decisions that are searched
+    :param search_unit: whether that is drawn for every ``"step"`` or every ``"episode"``
+    :param schedule_kwargs: additional settings of the schedule, see
+        :class:`~sb3_mcbs.agents.ScheduleSettings`
+    :param forward_model: what simulates: ``"auto"``, ``"mujoco"``, ``"pool"`` or ``"ensemble"`` (learned)
+    :param model_kwargs: additional settings of that: ``n_threads``, and for ``"ensemble"`` those of
+        :class:`~sb3_mcbs.agents.EnsembleSettings`
+    :param value_expansion: simulated steps before the critics' targets close (0: none, as SB3)
+    :param expanded_share: the share of every batch that this is done for
     :param action_noise_after_search: add ``action_noise`` to searched actions too
+    :param matmul_precision: of the networks' float32 products (None: as the process has it)
     :param fast_update: do gradient steps with SB3's mathematics but fewer instructions, where the networks
         are plain MLPs; others use SB3's own
-    :param preset: a name of :data:`~sb3_mcbs.search.PRESETS`: where the search's settings start from. Those
-        that are given hold in any case.
-    :param search_settings: the fields of :class:`~sb3_mcbs.SearchSettings` and
-        :class:`~sb3_mcbs.search.ScheduleSettings`
     """
 
     def __init__(
@@ -97,10 +92,24 @@ class MCBSTD3(MCBS, FastUpdate, TD3):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
         *,
-        action_noise_after_search: bool = False,
-        fast_update: bool = True,
+        beam_width: int | None = None,
+        rollout_depth: int | None = None,
+        n_simulations: int | None = None,
+        beam_noise: float | None = None,
+        strategy: str | None = None,
+        search_kwargs: dict[str, Any] | None = None,
         preset: str | None = None,
-        **search_settings: Unpack[SearchKeywords],
+        search_schedule: str = "constant",
+        search_share: float = 1.0,
+        search_unit: str = "step",
+        schedule_kwargs: dict[str, Any] | None = None,
+        forward_model: str = "auto",
+        model_kwargs: dict[str, Any] | None = None,
+        value_expansion: int = 0,
+        expanded_share: float = 0.5,
+        action_noise_after_search: bool = False,
+        matmul_precision: str | None = None,
+        fast_update: bool = True,
     ) -> None:
         super().__init__(
             policy,
@@ -129,7 +138,7 @@ class MCBSTD3(MCBS, FastUpdate, TD3):
             device=device,
             _init_setup_model=False,
         )
-        self._init_search(action_noise_after_search, search_settings, preset)
+        self._init_search(locals())
         self.fast_update = fast_update
 
         if _init_setup_model:

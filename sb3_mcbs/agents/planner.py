@@ -18,6 +18,8 @@ from sb3_mcbs.models import ForwardModelError
 from sb3_mcbs.networks.functions import check_agent, policy_function, unscale_function, value_function
 from sb3_mcbs.networks.torch_settings import go_on_in_process, matmul_precision, one_thread
 from sb3_mcbs.search import (
+    BeamSettings,
+    CEMSettings,
     EpisodeClock,
     FirstStep,
     LatencyForecast,
@@ -135,7 +137,7 @@ class Planner:
         dims = settings.proposal_dims
         directions = None if dims is None else self.recent_actions.directions(dims)
         with one_thread(), matmul_precision(settings.matmul_precision):
-            if settings.time_budget is None:
+            if not isinstance(settings, BeamSettings) or settings.time_budget is None:
                 plans = self._recall(envs, settings)
                 result = search(roots, functions, settings, rng, directions, plans)
                 self._keep(result, envs)
@@ -342,7 +344,7 @@ class Planner:
         return ExactRoots(self._vec_env, settings, normalizer)
 
     def _make_warm_start(self, settings: SearchSettings) -> WarmStart | None:
-        if settings.strategy != "refine":
+        if not isinstance(settings, CEMSettings):
             return None
         known = vars(self).get("_warm_start")
         if known is not None and settings.horizon == self.settings.horizon:

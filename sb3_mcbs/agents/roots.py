@@ -10,7 +10,7 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_mcbs.agents.faults import check_observations
-from sb3_mcbs.agents.learned_model import LearnedModel
+from sb3_mcbs.agents.learned_model import EnsembleSettings, LearnedModel
 from sb3_mcbs.agents.observation_pipeline import (
     EnvironmentPipeline,
     ObservationPipeline,
@@ -255,8 +255,8 @@ class ExactRoots(RootSource):
 class LearnedRoots(RootSource):
     """The agent's observations, from which the model that it learned goes on.
 
-    The environments may be of any kind: they are neither wrapped nor copied. A refinement starts anew at
-    every decision, since observations do not tell which steps were taken since the last one.
+    The environments may be of any kind: they are neither wrapped nor copied. The cross-entropy method starts
+    anew at every decision, since observations do not tell which steps were taken since the last one.
 
     :param agent: an agent that learns a model, or has learned one.
     :param vec_env: the environments.
@@ -279,7 +279,7 @@ class LearnedRoots(RootSource):
             self._learned.ensemble,
             agent.observation_space,
             agent.action_space,
-            self._agent.ensemble_pessimism,
+            self._ensemble_settings.ensemble_pessimism,
         )
         self._originals: Observations | None = None
         self._n_searches = 0
@@ -297,19 +297,23 @@ class LearnedRoots(RootSource):
         return learned
 
     @property
+    def _ensemble_settings(self) -> EnsembleSettings:
+        return EnsembleSettings.of(self._agent)
+
+    @property
     def ready(self) -> bool:
-        return self._learned.ensemble.held_out_error <= self._agent.ensemble_max_error
+        return self._learned.ensemble.held_out_error <= self._ensemble_settings.ensemble_max_error
 
     def capture_roots(self, observations: Observations, envs: Sequence[int]) -> Roots:
         self.model.ensemble = self._learned.ensemble
-        self.model.pessimism = self._agent.ensemble_pessimism
+        self.model.pessimism = self._ensemble_settings.ensemble_pessimism
         if not self.ready and not self._said_not_ready:
             self._said_not_ready = True
             logger.warning(
                 "The learned model is not used yet: its held-out error is %.3g, above "
                 "ensemble_max_error=%.3g. The policy acts alone.",
                 self._learned.ensemble.held_out_error,
-                self._agent.ensemble_max_error,
+                self._ensemble_settings.ensemble_max_error,
             )
         self._n_searches += 1
         self._originals = take_rows(self.view.original(observations), slice(None))

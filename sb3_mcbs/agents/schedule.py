@@ -9,6 +9,7 @@ from sb3_mcbs.agents.saturation import Episode, Saturation
 from sb3_mcbs.search.checks import CheckedSettings
 from sb3_mcbs.search.random_streams import spawn_rng
 from sb3_mcbs.search.settings import MAX_DEPTH, MAX_ROLLOUTS, SearchSettings
+from sb3_mcbs.search.strategy_settings import BeamSettings, CEMSettings, TreeSettings
 
 SCHEDULES = ("constant", "saturation", "anneal")
 UNITS = ("step", "episode")
@@ -19,6 +20,8 @@ _LEFT_WHEN_SATURATED = 0.2
 @dataclass(frozen=True)
 class ScheduleSettings(CheckedSettings):
     """Which decisions of a training are searched, and how wide and deep.
+
+    The first three are keywords of an agent's constructor, the others are given in ``schedule_kwargs``.
 
     :param search_schedule: ``"constant"``; ``"saturation"`` (``search_share`` until the return stops
         improving, then ``final_search_share``, and back when returns fall); ``"anneal"`` (from
@@ -41,6 +44,9 @@ class ScheduleSettings(CheckedSettings):
     :raises TypeError: if a value has the wrong type.
     :raises ValueError: if a value is out of range, or has no meaning with the schedule.
     """
+
+    group = "schedule_kwargs"
+    flat = ("search_schedule", "search_share", "search_unit")
 
     search_schedule: str = "constant"
     search_share: float = 1.0
@@ -114,15 +120,15 @@ class ScheduleSettings(CheckedSettings):
         :param settings: where it begins.
         :raises ValueError: says which setting, and why.
         """
-        if self.final_beam_width is not None and settings.strategy == "tree" and settings.n_proposals:
+        if self.final_beam_width is not None and isinstance(settings, TreeSettings) and settings.n_proposals:
             raise ValueError(
                 "final_beam_width does not go with n_proposals of a tree, which must be a multiple of every "
                 "beam_width in between: leave one of the two out."
             )
         if self.final_rollout_depth is not None:
-            if settings.strategy == "refine":
+            if isinstance(settings, CEMSettings):
                 raise ValueError(
-                    "final_rollout_depth does not go with strategy='refine', whose plans keep their length "
+                    "final_rollout_depth does not go with strategy='cem', whose plans keep their length "
                     "from one decision to the next: leave it out, or use another strategy."
                 )
             if (self.final_rollout_depth == 0) != (settings.rollout_depth == 0):
@@ -130,7 +136,8 @@ class ScheduleSettings(CheckedSettings):
                     "rollout_depth and final_rollout_depth must both be 0 or both be 1 or more; got "
                     f"{settings.rollout_depth} and {self.final_rollout_depth}."
                 )
-        if self.final_beam_width is not None and settings.max_beam_width is not None:
+        most = settings.max_beam_width if isinstance(settings, BeamSettings) else None
+        if self.final_beam_width is not None and most is not None:
             raise ValueError(
                 "final_beam_width has no meaning with max_beam_width, which is the number of candidates that "
                 "is enough: leave one of the two out."

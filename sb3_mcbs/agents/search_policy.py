@@ -3,7 +3,7 @@
 import operator
 from collections.abc import Collection
 from copy import copy, deepcopy
-from dataclasses import replace
+from types import MappingProxyType
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -12,18 +12,28 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.preprocessing import maybe_transpose
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-from sb3_mcbs.agents.hyperparameters import REMOVED, SETTING_NAMES, refuse_removed, settings_of_preset
+from sb3_mcbs.agents.hyperparameters import (
+    MOVED,
+    REMOVED,
+    SETTINGS,
+    RefusesOldNames,
+    refuse_old_names,
+    settings_of_preset,
+)
 from sb3_mcbs.agents.mcbs import MCBS
 from sb3_mcbs.agents.planner import Planner
 from sb3_mcbs.agents.resumable import Searching
-from sb3_mcbs.search import SearchResult, SearchSettings, with_preset
+from sb3_mcbs.search import SearchResult, SearchSettings, make_settings, with_preset
+from sb3_mcbs.search.settings import merged
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 
 #: What is not simply replaced when it is set.
 _HELD = ("model", "vec_env", "settings", "preset")
+#: The settings that are attributes.
+_OWN = (*SearchSettings.flat, "strategy", "search_kwargs", "model_kwargs")
 
 
-class SearchPolicy(Searching):
+class SearchPolicy(RefusesOldNames, Searching):
     """
     A trained agent that looks ahead before it acts, with SB3's ``predict`` signature.
 
@@ -46,10 +56,20 @@ class SearchPolicy(Searching):
     :param seed: seed of the search's own generator; None: a fresh one
     :param normalize_reward: whether the critics were trained on rewards that ``VecNormalize`` scaled.
         None: found out from the environment that the agent was trained in, or assumed from the statistics
+    :param beam_width: this and the following are those of :class:`~sb3_mcbs.MCBSTD3`; what is not given, also
+        within ``search_kwargs`` and ``model_kwargs``, is what the agent trained with, or the preset's, or the
+        default
+    :param rollout_depth: simulated steps per rollout
+    :param n_simulations: rollouts per candidate
+    :param beam_noise: standard deviation of the noise that makes candidates
+    :param strategy: ``"beam"``, ``"tree"`` or ``"cem"``
+    :param search_kwargs: further settings of the strategy, see :class:`~sb3_mcbs.BeamSettings`,
+        :class:`~sb3_mcbs.TreeSettings` and :class:`~sb3_mcbs.CEMSettings`
     :param preset: a name of :data:`~sb3_mcbs.search.PRESETS`: where the settings start from, instead of
         those that the agent trained with
-    :param search_settings: the fields of :class:`~sb3_mcbs.SearchSettings`; those not given are
-        those that the agent trained with, or the preset's, or the defaults
+    :param forward_model: what simulates
+    :param model_kwargs: ``n_threads``
+    :param matmul_precision: of the networks' float32 products
     """
 
     #: What an exact checkpoint does not contain, and why.
@@ -64,22 +84,29 @@ class SearchPolicy(Searching):
         vec_env: VecEnv | gym.Env,
         seed: int | None = None,
         normalize_reward: bool | None = None,
+        *,
+        beam_width: int | None = None,
+        rollout_depth: int | None = None,
+        n_simulations: int | None = None,
+        beam_noise: float | None = None,
+        strategy: str | None = None,
+        search_kwargs: dict[str, Any] | None = None,
         preset: str | None = None,
-        **search_settings: Any,
+        forward_model: str | None = None,
+        model_kwargs: dict[str, Any] | None = None,
+        matmul_precision: str | None = None,
     ) -> None:
-        refuse_removed(search_settings)
-        unknown = sorted(set(search_settings) - set(SearchSettings.names()))
-        if unknown:
-            raise TypeError(f"Unknown search settings {unknown}; known are {list(SearchSettings.names())}.")
+        arguments = locals()
+        given = {name: arguments[name] for name in _OWN if arguments[name] is not None}
         if normalize_reward is not None and not isinstance(normalize_reward, bool):
             raise TypeError(f"normalize_reward must be True, False or None, got {normalize_reward!r}.")
         self.model = model
         if preset is None and isinstance(model, MCBS):
-            if search_settings.get("rollout_depth") == 0:  # where nothing simulates, no model does
-                search_settings = {"forward_model": "auto", **search_settings}
-            self.settings = replace(model.search_settings, **search_settings)
+            if rollout_depth == 0:  # where nothing simulates, no model does
+                given = {"forward_model": "auto", **given}
+            self.settings = make_settings(**merged(model.search_settings.grouped(), given))
         else:
-            self.settings = SearchSettings(**with_preset(preset, search_settings))
+            self.settings = make_settings(**with_preset(preset, given))
         self.vec_env = _as_agents_vec_env(vec_env, model)
         self.rng = np.random.default_rng(seed)
         self.last_result: SearchResult | None = None
@@ -97,18 +124,18 @@ class SearchPolicy(Searching):
             self._change_settings(value)
         elif name == "preset":
             if value is not None:
-                self.settings = replace(self.settings, **_of_the_search(settings_of_preset(value)))
+                self._change(settings_of_preset(value))
             attributes["preset"] = value
-        elif name in SearchSettings.names():
+        elif name in _OWN:
             changes = {name: value}
             if changes == {"rollout_depth": 0} and self.settings.forward_model == "ensemble":
                 changes["forward_model"] = "auto"  # where nothing simulates, no model does
-            self.settings = replace(self.settings, **changes)
-        elif name in REMOVED:
-            refuse_removed([name])
+            self._change(changes)
+        elif name in REMOVED or name in MOVED:
+            refuse_old_names({name: value})
         elif hasattr(self.model, name):
             setattr(self.model, name, value)
-        elif name in SETTING_NAMES:
+        elif name in SETTINGS:
             raise AttributeError(f"{name} is for agents that search while they train.")
         else:
             super().__setattr__(name, value)
@@ -119,9 +146,13 @@ class SearchPolicy(Searching):
         vars(made)["planner"] = copy(self.planner)
         return made
 
+    def _change(self, changes: dict[str, Any]) -> None:
+        own = {name: value for name, value in changes.items() if name in _OWN}
+        self.settings = make_settings(**{**self.settings.grouped(), **own})
+
     def _change_settings(self, settings: SearchSettings) -> None:
         if not isinstance(settings, SearchSettings):
-            raise TypeError(f"Expected SearchSettings, got {settings!r}.")
+            raise TypeError(f"Expected BeamSettings, TreeSettings or CEMSettings, got {settings!r}.")
         self.planner.follow(settings)
         vars(self)["settings"] = settings
 
@@ -164,11 +195,10 @@ class SearchPolicy(Searching):
     def __getattr__(self, name: str) -> Any:
         if name in ("model", "settings") or name.startswith("__"):
             raise AttributeError(name)
-        return getattr(self.settings if name in SearchSettings.names() else self.model, name)
-
-
-def _of_the_search(settings: dict[str, Any]) -> dict[str, Any]:
-    return {name: settings[name] for name in SearchSettings.names() if name in settings}
+        if name not in _OWN:
+            return getattr(self.model, name)
+        value = self.settings.grouped()[name]
+        return MappingProxyType(value) if isinstance(value, dict) else value
 
 
 def _as_vec_env(env: VecEnv | gym.Env) -> VecEnv:

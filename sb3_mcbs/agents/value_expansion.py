@@ -49,6 +49,8 @@ class ValueExpansionSettings(CheckedSettings):
     :raises ValueError: if a value is out of range.
     """
 
+    flat = ("value_expansion", "expanded_share")
+
     value_expansion: int = 0
     expanded_share: float = 0.5
 

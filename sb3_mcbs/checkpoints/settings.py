@@ -101,7 +101,10 @@ def make_agent(encoded: Encoded, names: dict[str, Any], env: GymEnv) -> OffPolic
     restore = Restore(decoder.decode_nodes(encoded.json["nodes"]), HANDLERS, [], "restore")
     settings = {name: restore(decoder.decode(value)) for name, value in encoded.json["settings"].items()}
     restore.commit()
-    return cls(env=env, **settings)
+    try:
+        return cls(env=env, **settings)
+    except TypeError as reason:  # of a version with other settings
+        raise CheckpointError(f"The agent cannot be made as the checkpoint says: {reason}") from reason
 
 
 def describe_vec_env(vec_env: VecEnv) -> dict[str, Any] | None:
@@ -259,7 +262,7 @@ def inexact(agent: OffPolicyAlgorithm) -> list[str]:
     :param agent: the agent.
     """
     reasons = []
-    if getattr(agent, "time_budget", None) is not None:
+    if (getattr(agent, "search_kwargs", None) or {}).get("time_budget") is not None:
         reasons.append("time_budget makes decisions depend on how fast the machine is")
     if agent.device.type != "cpu":
         reasons.append(f"on {agent.device} networks are not computed in a fixed order")

@@ -16,15 +16,20 @@ from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 
+from sb3_mcbs.agents.hyperparameters import MOVED, group_flat
+from sb3_mcbs.agents.learned_model import EnsembleSettings
 from sb3_mcbs.agents.mcbs import MCBS
 from sb3_mcbs.agents.registry import ALGORITHMS
 from sb3_mcbs.loading.agent_file import AgentFile, is_pickled, read_agent_file
 from sb3_mcbs.loading.architecture import Architecture, check_shapes, check_spaces, read_architecture
 from sb3_mcbs.loading.archive import AgentFileError
 from sb3_mcbs.loading.network_settings import is_number, network_settings
-from sb3_mcbs.search import SearchSettings
+from sb3_mcbs.search import SearchSettings, make_settings
 
 logger = logging.getLogger("sb3_mcbs")
+
+#: What is taken over of the search; older files lack the last two.
+_SEARCH = (*SearchSettings.flat, "strategy", "search_kwargs", "model_kwargs")
 
 
 def load_agent(
@@ -76,7 +81,8 @@ def load_agent(
     agent = _build(ALGORITHMS[name], env, networks, numbers, architecture.use_sde, device, file.tensors)
     for warning in warnings:
         logger.warning("%s: %s", file.path, warning)
-    left = _not_taken_over(file, {*numbers, "use_sde"}, policy_kwargs)
+    taken = {"use_sde", *numbers, *(name for name, group in MOVED.items() if group in numbers)}
+    left = _not_taken_over(file, taken - set(EnsembleSettings.names()), policy_kwargs)
     agent.not_taken_over = left  # type: ignore[attr-defined]
     kind, activation = type(agent).__name__, networks["activation_fn"].__name__
     logger.info("%s: loaded as %s with %s. Not taken over: %s", file.path, kind, activation, list(left))
@@ -132,21 +138,27 @@ def _numbers(file: AgentFile, algo: str, architecture: Architecture) -> tuple[di
             lambda value: type(value) is int and 0 <= value < architecture.n_outputs,
             f"an integer from 0 to below the number of quantiles, {architecture.n_outputs}",
         )
-    settings = (
-        SearchSettings.names() if "beam_width" in file.data and issubclass(ALGORITHMS[algo], MCBS) else ()
-    )
-    values, warnings = {}, []
-    for name in (*checks, *settings):
-        if name not in file.data or is_pickled(file.data[name]):
-            warnings.append(
-                f"{name} is not there as a plain value; the default is used. Set it on the agent."
-            )
-        elif name in checks and not checks[name][0](file.data[name]):
-            raise AgentFileError(f"{name} must be {checks[name][1]}, got {str(file.data[name])[:80]!r}.")
-        else:
-            values[name] = file.data[name]
+    searches = "beam_width" in file.data and issubclass(ALGORITHMS[algo], MCBS)
+    names = (*checks, *(_SEARCH if searches else ()))
+    data = {name: value for name, value in file.data.items() if not is_pickled(value)}
+    warnings = [
+        f"{name} is not there as a plain value; the default is used. Set it on the agent."
+        for name in (*names, *(MOVED if searches else ()))
+        if name not in data and (name in file.data or name in (*checks, *_SEARCH[:-2]))
+    ]
+    for name, (check, words) in checks.items():
+        if name in data and not check(data[name]):
+            raise AgentFileError(f"{name} must be {words}, got {str(data[name])[:80]!r}.")
+    group_flat(data)
+    values = {name: data[name] for name in names if name in data}
     try:
-        SearchSettings(**{name: value for name, value in values.items() if name in settings})
+        if isinstance(values.get("model_kwargs"), dict):  # no learned model is read
+            values["model_kwargs"] = {
+                key: value
+                for key, value in values["model_kwargs"].items()
+                if key not in EnsembleSettings.in_group()
+            }
+        make_settings(**{name: value for name, value in values.items() if name in _SEARCH})
     except (TypeError, ValueError, OverflowError) as reason:
         raise AgentFileError(f"search settings: {str(reason)[:300]}") from reason
     return values, warnings

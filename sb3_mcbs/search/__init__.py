@@ -5,12 +5,15 @@ from sb3_mcbs.search.deadline import LatencyForecast, deadline_search
 from sb3_mcbs.search.directions import RecentActions
 from sb3_mcbs.search.interface import FirstStep, PolicyFunctions, Rollouts, Roots, SearchResult, policy_alone
 from sb3_mcbs.search.proposals import Noise, draw_noise
-from sb3_mcbs.search.settings import PRESETS, SearchSettings, with_preset
+from sb3_mcbs.search.settings import PRESETS, SearchSettings, make_settings, with_preset
 from sb3_mcbs.search.strategies import check_dynamics, search
+from sb3_mcbs.search.strategy_settings import BeamSettings, CEMSettings, TreeSettings
 from sb3_mcbs.search.warm_start import EpisodeClock, WarmStart
 
 __all__ = [
     "PRESETS",
+    "BeamSettings",
+    "CEMSettings",
     "EpisodeClock",
     "FirstStep",
     "LatencyForecast",
@@ -21,11 +24,13 @@ __all__ = [
     "Roots",
     "SearchResult",
     "SearchSettings",
+    "TreeSettings",
     "WarmStart",
     "beam_search",
     "check_dynamics",
     "deadline_search",
     "draw_noise",
+    "make_settings",
     "policy_alone",
     "search",
     "with_preset",

@@ -17,7 +17,7 @@ from sb3_mcbs.search.interface import (
     policy_alone,
 )
 from sb3_mcbs.search.proposals import draw_noise, propose
-from sb3_mcbs.search.settings import SearchSettings
+from sb3_mcbs.search.strategy_settings import BeamSettings
 from sb3_mcbs.types import ForwardModel, Transition
 
 #: How many past durations a forecast looks at, and which share of them it covers: of rounds, and of single
@@ -186,7 +186,7 @@ class _WatchedModel(ForwardModel):
 def deadline_search(
     roots: Roots,
     functions: PolicyFunctions,
-    settings: SearchSettings,
+    settings: BeamSettings,
     deadline: float,
     pace: LatencyForecast,
     rng: np.random.Generator,

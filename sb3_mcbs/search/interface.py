@@ -96,7 +96,7 @@ class SearchResult(NamedTuple):
     :param chosen: ``[n_envs]``, which candidate that is; -1 where every candidate was invalid and the
         policy's own action was taken.
     :param candidates: ``[n_envs, beam, act_dim]``, all that were simulated: of a tree the root actions, of a
-        refinement the first actions of all its rounds.
+        cross-entropy method the first actions of all its rounds.
     :param values: ``[n_envs, beam]``, Q~_i; -inf where a simulation of the candidate was invalid. In a tree
         a root action that was dropped keeps the value with which it was dropped.
     :param first_step: the chosen candidates' first simulated step (of their first simulation);
@@ -106,8 +106,8 @@ class SearchResult(NamedTuple):
     :param rounds: finished rounds: 1, or any number if the search had a time budget, or ``n_rounds``.
     :param critic_evaluations: observations with an action that the critics rated.
     :param surviving_roots: of a tree: ``[n_envs]``, how many root actions still had a node at the end.
-    :param plans: of a refinement: ``[n_envs, rollout_depth, act_dim]``, the plans that the actions are from;
-        0 where none was valid.
+    :param plans: of the cross-entropy method: ``[n_envs, rollout_depth, act_dim]``, the plans that the actions
+        are from; 0 where none was valid.
     """
 
     actions: np.ndarray

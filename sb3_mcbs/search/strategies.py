@@ -1,14 +1,15 @@
-"""The strategies by their names, behind one way to call them."""
+"""The strategies by the classes of their settings, behind one way to call them."""
 
 import logging
 
 import numpy as np
 
 from sb3_mcbs.search.beam import beam_search
+from sb3_mcbs.search.cem import cem_search, draw_plan_noise
 from sb3_mcbs.search.interface import CountedValue, PolicyFunctions, Roots, SearchResult
 from sb3_mcbs.search.proposals import draw_noise
-from sb3_mcbs.search.refine import draw_plan_noise, refine_search
 from sb3_mcbs.search.settings import SearchSettings
+from sb3_mcbs.search.strategy_settings import BeamSettings, CEMSettings, TreeSettings
 from sb3_mcbs.search.tree import draw_tree_noise, tree_search
 from sb3_mcbs.types import n_rows
 
@@ -30,23 +31,25 @@ def search(
     :param settings: settings of the search.
     :param rng: of the search: draws all noise, and is given to a model with random dynamics.
     :param directions: ``[proposal_dims, act_dim]``, in which candidates differ; ``None``: in all.
-    :param plans: of a refinement: ``[n_envs, rollout_depth, act_dim]`` to start around; ``None``: 0.
+    :param plans: of the cross-entropy method: ``[n_envs, rollout_depth, act_dim]``, where it starts from;
+        ``None``: from the policy alone.
     :return: actions, and what the search found.
     """
     value = CountedValue(functions.value)
     functions = functions._replace(value=value)
     n_envs, act_dim = n_rows(roots.observations), functions.act_dim
-    if settings.strategy == "beam":
+    if isinstance(settings, BeamSettings):
         noise = draw_noise(rng, settings, n_envs, act_dim, directions=directions)
         result = beam_search(roots, functions, settings, noise, rng)
-    elif settings.strategy == "tree":
+    elif isinstance(settings, TreeSettings):
         tree_noise = draw_tree_noise(rng, settings, n_envs, act_dim, directions)
         result = tree_search(roots, functions, settings, tree_noise, rng)
     else:
+        assert isinstance(settings, CEMSettings)
         if plans is None:
             plans = np.zeros((n_envs, settings.rollout_depth, act_dim), dtype=np.float32)
         plan_noise = draw_plan_noise(rng, settings, n_envs, act_dim)
-        result = refine_search(roots, functions, settings, plan_noise, rng, plans, directions)
+        result = cem_search(roots, functions, settings, plan_noise, rng, plans, directions)
     return result._replace(critic_evaluations=value.evaluations)
 
 
@@ -57,7 +60,7 @@ def check_dynamics(settings: SearchSettings, deterministic: bool) -> None:
     :param deterministic: whether the environment's steps are.
     :raises ValueError: if the search would follow the luckiest random draw.
     """
-    if not deterministic and settings.strategy != "beam" and settings.n_simulations == 1:
+    if not deterministic and not isinstance(settings, BeamSettings) and settings.n_simulations == 1:
         raise ValueError(
             f"strategy={settings.strategy!r} needs n_simulations of 2 or more here: the environment's steps "
             "are random, and with one simulation the luckiest draw would win."

@@ -28,7 +28,7 @@ from sb3_mcbs.search.proposals import (
     propose,
     scale,
 )
-from sb3_mcbs.search.settings import SearchSettings
+from sb3_mcbs.search.strategy_settings import TreeSettings
 from sb3_mcbs.types import ForwardModel, Observations, take_rows
 
 
@@ -88,7 +88,7 @@ class _Growth(NamedTuple):
 
 def draw_tree_noise(
     rng: np.random.Generator,
-    settings: SearchSettings,
+    settings: TreeSettings,
     n_envs: int,
     act_dim: int,
     directions: np.ndarray | None = None,
@@ -115,7 +115,7 @@ def draw_tree_noise(
 def tree_search(
     roots: Roots,
     functions: PolicyFunctions,
-    settings: SearchSettings,
+    settings: TreeSettings,
     noise: TreeNoise,
     rng: np.random.Generator,
 ) -> SearchResult:
@@ -192,7 +192,7 @@ def _children(
     drawn: np.ndarray,
     children: int,
     functions: PolicyFunctions,
-    settings: SearchSettings,
+    settings: TreeSettings,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Propose actions in every simulation that goes on.
 
@@ -224,7 +224,7 @@ def _grow(
     children: int,
     steps_before: int,
     functions: PolicyFunctions,
-    settings: SearchSettings,
+    settings: TreeSettings,
 ) -> _Growth:
     """Step the children, whose rows the forward model holds, for a macro-step, and value them.
 

@@ -1,4 +1,4 @@
-"""What a refinement remembers from one decision to the next."""
+"""What the cross-entropy method remembers from one decision to the next."""
 
 from collections.abc import Sequence
 from typing import Any

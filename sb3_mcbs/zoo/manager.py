@@ -8,24 +8,33 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 import optuna
+from optuna.storages import JournalStorage
+from optuna.storages.journal import JournalFileBackend
 from rl_zoo3.exp_manager import ExperimentManager
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_mcbs.agents.hyperparameters import REMOVED, SETTING_NAMES, refuse_removed, settings_of_preset
+from sb3_mcbs.agents.hyperparameters import (
+    GROUPS,
+    MOVED,
+    REMOVED,
+    SETTINGS,
+    refuse_old_names,
+    settings_of_preset,
+)
 from sb3_mcbs.agents.registry import SEARCHING
 from sb3_mcbs.agents.schedule import SCHEDULES, UNITS
 from sb3_mcbs.checkpoints import CheckpointError, ExactCheckpointCallback
 from sb3_mcbs.checkpoints.resume import CheckpointedRun
 from sb3_mcbs.models import ForwardModelError
-from sb3_mcbs.search import PRESETS, SearchSettings, with_preset
-from sb3_mcbs.search.settings import MATMUL_PRECISIONS, STRATEGIES
+from sb3_mcbs.search import PRESETS, SearchSettings, make_settings, with_preset
+from sb3_mcbs.search.settings import MATMUL_PRECISIONS, STRATEGIES, merged, present_name
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 from sb3_mcbs.types import BACKENDS
 from sb3_mcbs.zoo.callbacks import SearchEvalCallback, SecondEvalCallback
 from sb3_mcbs.zoo.paths import PathError, hyperparams_path, sibling_folder
-from sb3_mcbs.zoo.sampler import HELD
+from sb3_mcbs.zoo.sampler import HELD, with_limits
 
 #: ``-conf sb3_mcbs`` names this package's file for the algorithm of the command line.
 PACKAGE_CONFIG = "sb3_mcbs"
@@ -36,7 +45,7 @@ CHECKPOINTS = "checkpoints"
 #: The settings that are names, and what they may be.
 NAMES = {
     "preset": tuple(PRESETS),
-    "strategy": STRATEGIES,
+    "strategy": tuple(STRATEGIES),
     "forward_model": BACKENDS,
     "matmul_precision": MATMUL_PRECISIONS,
     "search_schedule": SCHEDULES,
@@ -126,8 +135,30 @@ class MCBSExperimentManager(ExperimentManager):
                 raise ValueError(
                     "Trials draw the search's settings and know no preset: leave preset out of -params."
                 )
-            self.custom_hyperparams = {**settings_of_preset(custom["preset"]), **custom}
+            self.custom_hyperparams = merged(settings_of_preset(custom["preset"]), custom)
         return super().read_hyperparameters()
+
+    def load_trial(
+        self, storage: str, study_name: str, trial_id: int | None = None, convert: bool = True
+    ) -> dict[str, Any]:
+        """
+        Load a trial's parameters as RL Zoo does, with the limits that the trial searched in.
+
+        :param storage: where the study is
+        :param study_name: its name
+        :param trial_id: the trial's number; None: the best one
+        :param convert: whether to make constructor arguments of them
+        :return: the parameters
+        """
+        params = super().load_trial(storage, study_name, trial_id, convert)
+        if not convert or self.algo not in SEARCHING:
+            return params
+        where: Any = storage
+        if storage.endswith(".log"):
+            where = JournalStorage(JournalFileBackend(storage))
+        study = optuna.load_study(storage=where, study_name=study_name)
+        trial = study.best_trial if trial_id is None else study.trials[trial_id]
+        return with_limits(params, trial.user_attrs.get(HELD, {}))
 
     def _preprocess_hyperparams(
         self, hyperparams: dict[str, Any]
@@ -149,7 +180,7 @@ class MCBSExperimentManager(ExperimentManager):
         :raises optuna.TrialPruned: also where RL Zoo prunes
         """
         if self.algo in SEARCHING:
-            names = {"optimize_memory_usage", *SETTING_NAMES}
+            names = {"optimize_memory_usage", *SETTINGS}
             held = {name: value for name, value in self._hyperparams.items() if name in names}
             trial.set_user_attr(HELD, held)
         try:
@@ -204,8 +235,16 @@ def _check_names(custom: dict[str, Any]) -> None:
     for name, value in custom.items():
         if name in REMOVED:
             sys.exit(f"-params {name}:{value}: {name} was removed: {REMOVED[name][1]}.")
-        if not isinstance(value, str) or name not in {"preset", *SETTING_NAMES}:
+        if name in MOVED:
+            sys.exit(
+                f"-params {name}:{value}: {name} is now part of {MOVED[name]}: write "
+                f'"{MOVED[name]}:dict({name}={value!r})".'
+            )
+        if not isinstance(value, str) or name not in SETTINGS:
             continue
+        if name in GROUPS:
+            sys.exit(f"-params {name}:{value}: must be a dictionary, such as dict(NAME=VALUE), or None.")
+        value = present_name(value) if name == "strategy" else value
         if name not in NAMES:
             sys.exit(f"-params {name}:{value}: must be a number, True, False or None.")
         if value not in NAMES[name]:
@@ -230,14 +269,14 @@ def _checked_search_evaluation(settings: Any, algo: str) -> dict[str, Any]:
         )
     settings = dict(settings)
     settings = with_preset(settings.pop("preset", None), settings)
-    refuse_removed(settings)
-    unknown = sorted(set(settings) - set(SearchSettings.names()))
+    refuse_old_names(settings)
+    known = (*SearchSettings.flat, "strategy", "search_kwargs", "model_kwargs")
+    unknown = sorted(set(settings) - set(known))
     if unknown:
         raise ValueError(
-            f"search_evaluation has unknown settings: {', '.join(unknown)}. "
-            f"Known are: {', '.join(SearchSettings.names())}."
+            f"search_evaluation has unknown settings: {', '.join(unknown)}. Known are: {', '.join(known)}."
         )
-    SearchSettings(**settings)
+    make_settings(**settings)
     return settings
 
 

@@ -17,13 +17,13 @@ import gymnasium as gym
 from stable_baselines3.common import env_util
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_mcbs.agents.hyperparameters import REMOVED, SETTING_NAMES
+from sb3_mcbs.agents.hyperparameters import MOVED, REMOVED, SETTINGS
 from sb3_mcbs.agents.registry import SEARCHING
 from sb3_mcbs.zoo.sampler import convert_mcbs_params, sample_mcbs_params
 
 #: Hyperparameters whose values may be names, which need no quotes on the command line.
 NAMED = frozenset(
-    ("preset", *SETTING_NAMES, *REMOVED, "policy", "noise_type", "env_wrapper", "vec_env_wrapper", "callback")
+    (*SETTINGS, *MOVED, *REMOVED, "policy", "noise_type", "env_wrapper", "vec_env_wrapper", "callback")
 )
 #: What MuJoCo says whenever it reads HalfCheetah's XML, which is Gymnasium's and nobody here can change.
 DEPRECATION = "compiler attribute 'settotalmass' is deprecated"

@@ -9,17 +9,16 @@ what a trial does not draw.
 """
 
 import os
-from dataclasses import asdict
+from types import SimpleNamespace
 from typing import Any
 
 import optuna
 
-from sb3_mcbs.agents.hyperparameters import REMOVED, SETTING_NAMES
+from sb3_mcbs.agents.hyperparameters import MOVED, REMOVED, SETTINGS
 from sb3_mcbs.agents.schedule import SCHEDULES, UNITS, ScheduleSettings
 from sb3_mcbs.agents.value_expansion import ValueExpansionSettings
 from sb3_mcbs.search import SearchSettings
-from sb3_mcbs.search.checks import CheckedSettings
-from sb3_mcbs.search.settings import OF_THE_MACHINE
+from sb3_mcbs.search.settings import present_name
 
 SWITCH = "SB3_MCBS_TUNE"
 SCOPES = ("search", "strategies", "schedules", "all")
@@ -28,7 +27,7 @@ BEAM_WIDTHS = (3, 6, 12, 18)
 ROLLOUT_DEPTHS = (0, 1, 2, 3, 4, 6)
 N_SIMULATIONS = (1, 3, 5, 10)
 BEAM_NOISE = (0.01, 0.5)
-STRATEGIES = ("beam", "tree", "refine")
+STRATEGIES = ("beam", "tree", "cem")
 PROPOSAL_FACTORS = (1, 4, 8)
 BRANCHING = (2, 3, 5)
 N_ROUNDS = (2, 3, 4)
@@ -49,13 +48,13 @@ _NO_PRESET: dict[str, Any] = {"preset": None}
 
 #: The user attribute of a trial that says what the hyperparameter file holds of the search.
 HELD = "held_settings"
-#: Limits stay as they are held, and so does what the machine is given.
-_LIMITS = ("noise_clip", "min_noise", "time_budget", "max_beam_width", *OF_THE_MACHINE)
-#: What the scopes "strategies" and "schedules" replace of the held settings where they draw nothing.
-_STRATEGY: dict[str, Any] = {
-    name: value for name, value in asdict(SearchSettings()).items() if name not in _LIMITS
-}
-_SCHEDULE: dict[str, Any] = dict.fromkeys(("final_search_share", "final_beam_width", "final_rollout_depth"))
+#: Limits stay as they are held where the scope "strategies" draws the rest of ``search_kwargs``.
+#: The last is the cross-entropy method's alone.
+_LIMITS = ("noise_clip", "time_budget", "max_beam_width", "min_noise")
+#: What the scope "schedules" replaces of the held ``schedule_kwargs``.
+_ENDS = ("final_search_share", "final_beam_width", "final_rollout_depth")
+#: What trials store under names that are no keywords.
+_STORED = (*_HELPERS, *MOVED, *REMOVED)
 
 
 def tuning_scope() -> str:
@@ -90,14 +89,15 @@ def sample_mcbs_params(
         "rollout_depth": trial.suggest_categorical("rollout_depth", ROLLOUT_DEPTHS),
         "beam_noise": trial.suggest_float("beam_noise", *BEAM_NOISE, log=True),
     }
-    simulations_differ = held.get("strategy", "beam") == "beam" and held.get("rollout_noise") != 0
+    rollout_noise = (held.get("search_kwargs") or {}).get("rollout_noise")
+    simulations_differ = held.get("strategy", "beam") == "beam" and rollout_noise != 0
     if scope == "strategies" or simulations_differ:
         sampled["n_simulations"] = trial.suggest_categorical("n_simulations", N_SIMULATIONS)
     if scope == "strategies":
         sampled |= _sample_strategy(trial)
     if scope == "schedules":
         sampled |= _sample_schedule(trial)
-    params = _search_settings(sampled)
+    params = with_limits(_search_settings(sampled), held)
     reason = _why_senseless({**held, **params}, sampled, n_actions)
     if reason is not None:
         trial.set_user_attr("pruned", reason)
@@ -143,36 +143,65 @@ def _sample_schedule(trial: optuna.Trial) -> dict[str, Any]:
 
 
 def _search_settings(sampled: dict[str, Any]) -> dict[str, Any]:
-    """Turn what a trial stores of the search into settings."""
-    settings = {name: value for name, value in sampled.items() if name not in _HELPERS}
-    if "strategy" in sampled:
-        settings = {**_STRATEGY, **settings}
-    if "search_schedule" in sampled:
-        settings = {**_SCHEDULE, **settings}
+    """Turn what a trial stores of the search into constructor arguments."""
+    settings = {name: value for name, value in sampled.items() if name not in _STORED}
+    kwargs = {name: value for name, value in sampled.items() if MOVED.get(name) == "search_kwargs"}
     if sampled.get("noise_free_rollouts"):
-        settings["rollout_noise"] = 0.0
+        kwargs["rollout_noise"] = 0.0
     if settings.get("strategy", "beam") != "beam":
         settings["n_simulations"] = 1  # more are for random environments
     if sampled.get("proposal_factor", 1) > 1:
-        n_kept = settings["beam_width"] * settings.get("branching", 1)
-        settings["n_proposals"] = sampled["proposal_factor"] * n_kept
+        n_kept = settings["beam_width"] * kwargs.get("branching", 1)
+        kwargs["n_proposals"] = sampled["proposal_factor"] * n_kept
+    if "strategy" in sampled:
+        settings["strategy"] = present_name(sampled["strategy"])
+        settings["search_kwargs"] = kwargs
+    if "search_schedule" in sampled:
+        settings["schedule_kwargs"] = {}
     if "final_share_factor" in sampled:
-        settings["final_search_share"] = sampled["final_share_factor"] * settings["search_share"]
+        share = sampled["final_share_factor"] * settings["search_share"]
+        settings["schedule_kwargs"] = {"final_search_share": share}
     return settings
+
+
+def with_limits(params: dict[str, Any], held: dict[str, Any]) -> dict[str, Any]:
+    """
+    Keep of the held dictionaries what trials do not draw, since those of a trial replace them.
+
+    :param params: constructor arguments
+    :param held: what the hyperparameter file says of the search
+    :return: the arguments with the held limits
+    """
+    kwargs, ends = held.get("search_kwargs") or {}, held.get("schedule_kwargs") or {}
+    params = dict(params)
+    if "search_kwargs" in params:
+        limits = _LIMITS if params["strategy"] == "cem" else _LIMITS[:-1]
+        kept = {name: value for name, value in kwargs.items() if name in limits}
+        params["search_kwargs"] = {**kept, **params["search_kwargs"]}
+    if "schedule_kwargs" in params:
+        kept = {name: value for name, value in ends.items() if name not in _ENDS}
+        params["schedule_kwargs"] = {**kept, **params["schedule_kwargs"]}
+    return params
 
 
 def _why_senseless(params: dict[str, Any], sampled: dict[str, Any], n_actions: int) -> str | None:
     drawn = sampled.get("n_simulations", 1)
+    kwargs = params.get("search_kwargs") or {}
     if params["rollout_depth"] == 0 and drawn > 1:
         return "nothing is simulated at rollout_depth 0, so n_simulations above 1 repeats another trial"
-    if drawn > 1 and (params["n_simulations"] == 1 or params.get("rollout_noise") == 0):
+    if drawn > 1 and (params["n_simulations"] == 1 or kwargs.get("rollout_noise") == 0):
         return "n_simulations above 1 needs a beam with noise in its rollouts, else it repeats another trial"
-    if (params.get("proposal_dims") or 0) >= n_actions:
+    if (kwargs.get("proposal_dims") or 0) >= n_actions:
         return f"proposal_dims of {n_actions} or more repeats another trial: actions have no more directions"
+    if params.get("strategy", "beam") != "beam" and (
+        kwargs.get("time_budget") or kwargs.get("max_beam_width")
+    ):
+        return "time_budget works with strategy='beam' only"
+    agent = SimpleNamespace(**{**SETTINGS, **params})
     try:
-        settings = SearchSettings(**_of(params, SearchSettings))
-        ScheduleSettings(**_of(params, ScheduleSettings)).check_search(settings)
-        expansion = ValueExpansionSettings(**_of(params, ValueExpansionSettings))
+        settings = SearchSettings.of(agent)
+        ScheduleSettings.of(agent).check_search(settings)
+        expansion = ValueExpansionSettings.of(agent)
         expansion.check_search(settings)
         expansion.check_buffer(params.get("optimize_memory_usage", False))
     except ValueError as error:
@@ -182,10 +211,6 @@ def _why_senseless(params: dict[str, Any], sampled: dict[str, Any], n_actions: i
     return None
 
 
-def _of(params: dict[str, Any], settings: type[CheckedSettings]) -> dict[str, Any]:
-    return {name: value for name, value in params.items() if name in settings.names()}
-
-
 def convert_mcbs_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     """
     Turn the parameters that a trial stored back into constructor arguments.
@@ -193,7 +218,7 @@ def convert_mcbs_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     :param sampled_params: ``trial.params``
     :return: constructor arguments, as the sampler returned them
     """
-    search_names = {*_HELPERS, *SETTING_NAMES, *REMOVED}
+    search_names = {*_STORED, *SETTINGS}
     search = _search_settings({name: v for name, v in sampled_params.items() if name in search_names})
     search |= _NO_PRESET
     others = {name: value for name, value in sampled_params.items() if name not in search_names}

@@ -1,4 +1,4 @@
-"""Refinement: cross-entropy rounds around the best candidates so far.
+"""The cross-entropy method: rounds of plans around the best so far.
 
 A candidate is a *plan*: what is added to the policy's action at each of the next ``rollout_depth`` steps,
 ``a_t = clip(pi(s_t) + plan_t, -1, 1)``. Plans are rolled out as Algorithm 1 rolls out its candidates, only
@@ -14,7 +14,7 @@ from sb3_mcbs.search.beam import choose, join_rounds, mean_values, short_horizon
 from sb3_mcbs.search.directions import combine, gain
 from sb3_mcbs.search.interface import PolicyFunctions, Rollouts, Roots, SearchResult
 from sb3_mcbs.search.proposals import Noise, best, critic_values, draw_normal, preselect, propose, scale
-from sb3_mcbs.search.settings import SearchSettings
+from sb3_mcbs.search.strategy_settings import CEMSettings
 
 
 class Plans(NamedTuple):
@@ -29,9 +29,7 @@ class Plans(NamedTuple):
     spread: np.ndarray
 
 
-def draw_plan_noise(
-    rng: np.random.Generator, settings: SearchSettings, n_envs: int, act_dim: int
-) -> np.ndarray:
+def draw_plan_noise(rng: np.random.Generator, settings: CEMSettings, n_envs: int, act_dim: int) -> np.ndarray:
     """Draw the noise of one decision, of all rounds at once.
 
     :param rng: generator of the search.
@@ -45,10 +43,10 @@ def draw_plan_noise(
     return draw_normal(rng, shape, 2 if settings.antithetic else None)
 
 
-def refine_search(
+def cem_search(
     roots: Roots,
     functions: PolicyFunctions,
-    settings: SearchSettings,
+    settings: CEMSettings,
     noise: np.ndarray,
     rng: np.random.Generator,
     remembered: np.ndarray,
@@ -94,7 +92,7 @@ def refine_search(
     return result._replace(rounds=settings.n_rounds, plans=chosen_plans)
 
 
-def first_spread(settings: SearchSettings) -> np.ndarray:
+def first_spread(settings: CEMSettings) -> np.ndarray:
     """Standard deviations of the first round: ``beam_noise`` now, ``rollout_noise`` later.
 
     :return: ``[rollout_depth, 1]``.
@@ -108,7 +106,7 @@ def refit(
     source: Plans,
     plans: np.ndarray,
     values: np.ndarray,
-    settings: SearchSettings,
+    settings: CEMSettings,
     beginning: np.ndarray,
     directions: np.ndarray | None,
 ) -> Plans:
