@@ -106,8 +106,8 @@ class SearchResult(NamedTuple):
     :param rounds: finished rounds: 1, or any number if the search had a time budget, or ``n_rounds``.
     :param critic_evaluations: observations with an action that the critics rated.
     :param surviving_roots: of a tree: ``[n_envs]``, how many root actions still had a node at the end.
-    :param plans: of the cross-entropy method: ``[n_envs, rollout_depth, act_dim]``, the plans that the actions
-        are from; 0 where none was valid.
+    :param plans: of the cross-entropy method: ``[n_envs, rollout_depth, act_dim]``, what the
+        actions are from; 0 where none was valid.
     """
 
     actions: np.ndarray
