@@ -9,11 +9,12 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.preprocessing import get_action_dim
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_mcbs.agents.attributes import SearchAttributes
-from sb3_mcbs.agents.checked_rollouts import CheckedRollouts
+from sb3_mcbs.agents.decision_log import record_decision
+from sb3_mcbs.agents.expanding import Expanding
 from sb3_mcbs.agents.exploration import DrawnNoise, noise_without_search
 from sb3_mcbs.agents.faults import environment_named
 from sb3_mcbs.agents.hyperparameters import (
@@ -36,22 +37,15 @@ from sb3_mcbs.agents.planner import Planner
 from sb3_mcbs.agents.resumable import Resumable, Searching
 from sb3_mcbs.agents.roots import EnvironmentStep, Prediction
 from sb3_mcbs.agents.schedule import ScheduleSettings, SearchSchedule
-from sb3_mcbs.agents.value_expansion import (
-    ValueExpansionSettings,
-    batched_states,
-    drop_states,
-    expand,
-)
 from sb3_mcbs.networks.torch_settings import matmul_precision
-from sb3_mcbs.search import BeamSettings, FirstStep, RecentActions, SearchResult, SearchSettings
+from sb3_mcbs.search import RecentActions, SearchResult, SearchSettings
 from sb3_mcbs.search.random_streams import spawn_rng
 from sb3_mcbs.search.settings import merged
-from sb3_mcbs.types import take_rows
 
 SelfMCBS = TypeVar("SelfMCBS", bound="MCBS")
 
 
-class MCBS(SearchAttributes, Searching, Resumable, CheckedRollouts):
+class MCBS(SearchAttributes, Searching, Resumable, Expanding):
     """
     Monte Carlo Beam Search for an off-policy agent of SB3: the mixin that stands before it.
 
@@ -103,9 +97,8 @@ class MCBS(SearchAttributes, Searching, Resumable, CheckedRollouts):
         self.planner: Planner | None = None
         #: What the search predicted for the actions that are executed next.
         self._prediction: Prediction | None = None
-        #: The states that they are executed in, where value expansion reads them.
-        self._states: np.ndarray | None = None
-        self.rollout_rng: np.random.Generator | None = None
+        self._states = None
+        self.rollout_rng = None
         self.learned_model: LearnedModel | None = None
         self._noise_without_search: ActionNoise | None = None
 
@@ -134,8 +127,7 @@ class MCBS(SearchAttributes, Searching, Resumable, CheckedRollouts):
             self._schedule = SearchSchedule(schedule, self.seed)
         self._schedule.settings = schedule
         self._remember_actions(settings)
-        self._check_expansion()
-        self._keeps_states = self.value_expansion > 0
+        self._set_up_expansion(settings)
         set_up_learned_model(self)
         if self.env is not None:
             self._make_planner(self.env, settings)
@@ -148,12 +140,7 @@ class MCBS(SearchAttributes, Searching, Resumable, CheckedRollouts):
     def _follow_settings(self) -> None:
         settings, schedule = self._checked_settings()
         check_learned_model(self)
-        self._check_expansion()
-        if (self.value_expansion > 0) != self._keeps_states:
-            raise ValueError(
-                "value_expansion keeps states beside the replay buffer: it can be changed later, but not "
-                "from or to 0; save the agent, and load it with the other settings."
-            )
+        self._follow_expansion(settings)
         if self.planner is not None and self.planner.follow(settings):
             self._check_states()
             self._say_what_simulates()
@@ -163,22 +150,6 @@ class MCBS(SearchAttributes, Searching, Resumable, CheckedRollouts):
         if self.env is not None:
             self._explore_where_not_searched()
         self._note_dictionaries()
-
-    def _check_expansion(self) -> None:
-        expansion = ValueExpansionSettings.of(self)
-        expansion.check_search(self.search_settings)
-        assert self.replay_buffer is not None
-        expansion.check_buffer(self.replay_buffer.optimize_memory_usage)
-
-    def _check_states(self) -> None:
-        if self.value_expansion:
-            batched_states(self)  # refuses other forward models
-
-    def _expand_buffer(self) -> None:
-        """Whoever loads a replay buffer or sets an environment exchanges what value expansion needs."""
-        if self.value_expansion:
-            assert self.replay_buffer is not None
-            expand(self.replay_buffer, self)
 
     def _remember_actions(self, settings: SearchSettings) -> None:
         if self.recent_actions is None and settings.proposal_dims is not None:
@@ -256,7 +227,7 @@ class MCBS(SearchAttributes, Searching, Resumable, CheckedRollouts):
         """
         self._follow_dictionaries()
         self._prediction = None
-        self._states = batched_states(self) if self.value_expansion else None
+        self._note_states()
         self._check_noise_after_search()
         if self._noise_without_search is None:  # action_noise may have been taken away
             self._explore_where_not_searched()
@@ -285,8 +256,8 @@ class MCBS(SearchAttributes, Searching, Resumable, CheckedRollouts):
         if self.action_noise_after_search and noise is not None:
             drawn = np.broadcast_to(noise.last, scaled_actions.shape)[searched]
             found = np.clip(found + drawn, -1, 1).astype(found.dtype)
-        elif result.first_step is not None:
-            self._prediction = _prediction_of(result, searched)
+        else:
+            self._prediction = Prediction.of(result, searched)
         if executed.all():
             return self.policy.unscale_action(found), found
         # Of one kind, so that actions reach the environments as they are simulated.
@@ -304,7 +275,7 @@ class MCBS(SearchAttributes, Searching, Resumable, CheckedRollouts):
             self.planner.normalize_rewards(self._vec_normalize_env.norm_reward)
         start = time.perf_counter()
         result = self.planner.plan(self._last_obs, self.search_rng, envs, effort)
-        self._record_decision(result, time.perf_counter() - start, effort)
+        record_decision(self, result, time.perf_counter() - start, effort)
         return result
 
     @property
@@ -323,17 +294,13 @@ class MCBS(SearchAttributes, Searching, Resumable, CheckedRollouts):
 
     def _verify(self, actions: np.ndarray, happened: EnvironmentStep) -> None:
         """Compare what the forward model says of a step with what happened, and follow the environments."""
-        planner, prediction = self.planner, self._prediction
-        assert planner is not None and self.rollout_rng is not None
-        if self._states is not None:  # of every step, searched or not
-            prediction = planner.predict(list(self._states), actions, self.rollout_rng)
-            self.n_simulated_steps += 0 if prediction is None else len(actions)
-            self._states = None
-        error = None if prediction is None else planner.verify(prediction, happened)
+        assert self.planner is not None
+        prediction = self._predict_step(actions) or self._prediction
+        error = None if prediction is None else self.planner.verify(prediction, happened)
         if error is not None:
             self.logger.record_mean("search/model_error", error)
             if error > 0:
-                planner.resync(error)
+                self.planner.resync(error)
 
     def _raw_rewards(self, reward: np.ndarray) -> np.ndarray:
         """Rewards as the environments gave them."""
@@ -348,10 +315,6 @@ class MCBS(SearchAttributes, Searching, Resumable, CheckedRollouts):
         assert self._schedule is not None
         self._schedule.begin_episodes(self.n_envs, self.num_timesteps)
 
-    def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
-        self._expand_buffer()
-        return super().collect_rollouts(*args, **kwargs)
-
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         self._noise_without_search = None
         self._explore_where_not_searched()
@@ -359,8 +322,6 @@ class MCBS(SearchAttributes, Searching, Resumable, CheckedRollouts):
         if self.learned_model is not None:
             assert self.replay_buffer is not None
             self.learned_model.check_room(self.replay_buffer)
-        if not self.value_expansion:
-            drop_states(self.replay_buffer)
         result = super()._setup_learn(*args, **kwargs)
         if self._total_timesteps:  # what is known of progress is that of the training before
             self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
@@ -388,35 +349,8 @@ class MCBS(SearchAttributes, Searching, Resumable, CheckedRollouts):
         """
         if self.learned_model is not None:
             self.learned_model.fit_if_due(self, EnsembleSettings.of(self))
-        self._expand_buffer()
         with matmul_precision(self.matmul_precision):
             super().train(gradient_steps, batch_size)
-
-    def _record_decision(self, result: SearchResult, seconds: float, effort: SearchSettings) -> None:
-        n_envs = len(result.chosen)
-        self.n_decisions += n_envs
-        self.n_simulated_steps += result.simulated_steps
-        self.n_invalid_rollouts += result.invalid_rollouts
-        self.n_critic_evaluations += result.critic_evaluations
-        searched = result.chosen >= 0
-        values = result.values[searched]
-        if values.size and np.isfinite(values).all():
-            # In a tree the chosen root is that of the best leaf, which need not be the best root.
-            best = np.take_along_axis(values, result.chosen[searched][:, None], axis=1)[:, 0]
-            self.logger.record_mean("search/value_gain", float((best - values.mean(axis=1)).mean()))
-            self.logger.record_mean("search/beam_std", float(values.std(axis=1).mean()))
-        self.logger.record_mean("search/ms_per_decision", 1000 * seconds / n_envs)
-        if isinstance(effort, BeamSettings) and effort.time_budget is not None:
-            self.logger.record_mean("search/rounds", result.rounds)
-            self.logger.record_mean("search/candidates", result.values.shape[1])
-        if result.surviving_roots is not None:
-            self.logger.record_mean("search/surviving_roots", float(result.surviving_roots.mean()))
-        self.logger.record("search/beam_width", effort.beam_width)
-        self.logger.record("search/rollout_depth", effort.rollout_depth)
-        self.logger.record("search/critic_evaluations", self.n_critic_evaluations)
-        self.logger.record("search/decisions", self.n_decisions)
-        self.logger.record("search/simulated_steps", self.n_simulated_steps)
-        self.logger.record("search/invalid_rollouts", self.n_invalid_rollouts)
 
     def learn(
         self: SelfMCBS,
@@ -512,15 +446,3 @@ class MCBS(SearchAttributes, Searching, Resumable, CheckedRollouts):
         self._follow_settings()  # a callback may have changed them
         assert self.planner is not None
         self.planner.memory = memory
-
-
-def _prediction_of(result: SearchResult, envs: Sequence[int]) -> Prediction:
-    """What a search predicts for the actions that it chose.
-
-    :param result: of the search.
-    :param envs: the environments that were searched.
-    """
-    assert result.first_step is not None
-    rows = np.flatnonzero(result.chosen >= 0)
-    step = FirstStep(take_rows(result.first_step.observations, rows), result.first_step.rewards[rows])
-    return Prediction([envs[row] for row in rows.tolist()], result.actions[rows], step)

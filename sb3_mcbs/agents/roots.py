@@ -19,7 +19,7 @@ from sb3_mcbs.agents.observation_pipeline import (
 from sb3_mcbs.models import ForwardModelError, make_forward_model
 from sb3_mcbs.models.ensemble import Transitions
 from sb3_mcbs.models.ensemble_model import EnsembleModel
-from sb3_mcbs.search import EpisodeClock, FirstStep, Roots, SearchSettings, check_dynamics
+from sb3_mcbs.search import EpisodeClock, FirstStep, Roots, SearchResult, SearchSettings, check_dynamics
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 from sb3_mcbs.types import ForwardModel, Observations, difference, equal, row_of, stack, take_rows
 
@@ -37,6 +37,20 @@ class Prediction(NamedTuple):
     envs: Sequence[int]
     actions: np.ndarray
     step: FirstStep
+
+    @classmethod
+    def of(cls, result: SearchResult, envs: Sequence[int]) -> "Prediction | None":
+        """What a search predicts for the actions that it chose.
+
+        :param result: of the search.
+        :param envs: the environments that were searched.
+        :return: ``None`` if nothing was simulated.
+        """
+        if result.first_step is None:
+            return None
+        rows = np.flatnonzero(result.chosen >= 0)
+        step = FirstStep(take_rows(result.first_step.observations, rows), result.first_step.rewards[rows])
+        return cls([envs[row] for row in rows.tolist()], result.actions[rows], step)
 
 
 class EnvironmentStep(NamedTuple):
