@@ -113,7 +113,7 @@ class SearchAttributes(RefusesOldNames):
         """Remember what the dictionaries contain, which was checked."""
         vars(self)["_followed"] = deepcopy([getattr(self, group) for group in GROUPS])
         own = {"strategy": self.strategy, "search_kwargs": self.search_kwargs}
-        if with_preset(self.preset, own) != {**with_preset(self.preset, {}), **own}:
+        if with_preset(self.preset, own)["search_kwargs"] != self.search_kwargs:
             # An agent that is made with the same arguments would have what was taken from the preset.
             vars(self)["preset"] = None
 
