@@ -64,6 +64,16 @@ class RefusesOldNames:
         return super().__new__(cls)
 
 
+def sb3_arguments(arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """What the constructor of an agent passes on to SB3's.
+
+    :param arguments: of the constructor, ``locals()``.
+    """
+    ours = {*SETTINGS, "fast_update", "self", "__class__"}
+    passed_on = {name: value for name, value in arguments.items() if name not in ours}
+    return {**passed_on, "_init_setup_model": False}
+
+
 def complete_settings(arguments: Mapping[str, Any]) -> dict[str, Any]:
     """All settings of an agent.
 

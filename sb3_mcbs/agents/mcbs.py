@@ -53,7 +53,7 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
 
         class MCBSSAC(MCBS, SAC):
             def __init__(self, policy, env, ..., *, beam_width: int | None = None, ...) -> None:
-                super().__init__(policy, env, ..., _init_setup_model=False)
+                super().__init__(**sb3_arguments(locals()))
                 self._init_search(locals())
                 if _init_setup_model:
                     self._setup_model()
