@@ -1,4 +1,4 @@
-"""The networks of an SB3 policy, told from the names and shapes of its parameters."""
+"""Infers the networks of an SB3 policy from the names and shapes of its parameters."""
 
 import itertools
 from collections.abc import Iterator, Mapping
@@ -25,7 +25,7 @@ class Architecture:
     :param n_critics: how many critics there are.
     :param n_outputs: a critic's outputs; with several they are quantiles (TQC).
     :param use_sde: whether the exploration depends on the state (gSDE).
-    :param clips_mean: whether the actor clips its mean before it is squashed; only with gSDE.
+    :param clips_mean: whether the actor clips its mean before squashing it; only with gSDE.
     """
 
     stochastic: bool
@@ -85,11 +85,11 @@ def _widths(shapes: Mapping[str, Shape], prefix: str) -> Iterator[int]:
 
 
 def read_architecture(shapes: Mapping[str, Shape]) -> Architecture:
-    """Tell the architecture from parameters that may not fit together; :func:`check_shapes` finds that.
+    """Infer the architecture from names and output sizes; :func:`check_shapes` then checks every shape.
 
     :param shapes: shapes by name.
-    :return: what the names and the output sizes say.
-    :raises AgentFileError: if they are not those of an actor and critics that are MLPs.
+    :return: the architecture.
+    :raises AgentFileError: if the parameters are not those of an actor and critics that are MLPs.
     """
     for name in shapes:
         if "features_extractor" in name:
@@ -122,7 +122,7 @@ def check_spaces(observation_space: spaces.Space, action_space: spaces.Space) ->
 
     :param observation_space: its observations.
     :param action_space: its actions.
-    :raises ValueError: if observations are images or of several inputs, or actions not a Box.
+    :raises ValueError: if observations are images, a Dict or a Tuple, or actions are not a Box.
     """
     if isinstance(observation_space, spaces.Dict | spaces.Tuple) or is_image_space(observation_space):
         raise ValueError(
@@ -139,10 +139,10 @@ def check_shapes(
     observation_space: spaces.Space,
     action_space: Any,
 ) -> None:
-    """Refuse parameters that do not fit together, or not the environment.
+    """Refuse parameters that do not fit each other or the environment.
 
     :param shapes: the file's shapes by name.
-    :param architecture: what was told from them.
+    :param architecture: inferred from them.
     :param observation_space: the environment's observations.
     :param action_space: the environment's actions.
     :raises AgentFileError: if a parameter is missing, left over or of another shape.
