@@ -3,8 +3,9 @@
 import logging
 
 from sb3_mcbs.models.environments import Environments
-from sb3_mcbs.models.mujoco_batch import MujocoBatchModel, NotRecognizedError
+from sb3_mcbs.models.mujoco_batch import MujocoBatchModel
 from sb3_mcbs.models.pool import EnvPoolModel
+from sb3_mcbs.models.recognition import NotRecognizedError
 from sb3_mcbs.types import BACKENDS, ForwardModelError
 
 logger = logging.getLogger("sb3_mcbs")

@@ -15,7 +15,7 @@ from sb3_mcbs.models.recognition import (
     CHECK_ROLLOUTS,
     CHECK_STEPS,
     KnownEnvironment,
-    Refusal,
+    NotRecognizedError,
     Sample,
     read_root,
     recognize,
@@ -34,17 +34,6 @@ def _available_cpus() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
-
-
-class NotRecognizedError(ForwardModelError):
-    """The batch model refuses an environment.
-
-    :ivar notable: whether a user would have expected that it can be simulated.
-    """
-
-    def __init__(self, message: str, notable: bool = True) -> None:
-        super().__init__(message)
-        self.notable = notable
 
 
 class MujocoBatchModel(ForwardModel):
@@ -110,8 +99,8 @@ class MujocoBatchModel(ForwardModel):
     def _recognize_all(self) -> KnownEnvironment:
         found = self._environments.apply(range(len(self._environments)), recognize)
         for number, result in enumerate(found):
-            if isinstance(result, Refusal):
-                raise NotRecognizedError(f"environment {number}: {result.reason}", result.notable)
+            if isinstance(result, NotRecognizedError):
+                raise NotRecognizedError(f"environment {number}: {result}", result.notable)
         first: KnownEnvironment = found[0]
         for number, other in enumerate(found[1:], start=1):
             difference = first.difference(other)

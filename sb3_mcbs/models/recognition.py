@@ -38,15 +38,15 @@ _TRANSPARENT = {
 CHECK_ROLLOUTS, CHECK_STEPS, CHECK_SPACING = 4, 8, 9
 
 
-class Refusal(NamedTuple):
-    """Why the batch model cannot simulate an environment.
+class NotRecognizedError(ForwardModelError):
+    """The batch model refuses an environment.
 
-    :param reason: in words.
-    :param notable: whether a user would have expected that it can.
+    :ivar notable: whether a user would have expected that it can be simulated.
     """
 
-    reason: str
-    notable: bool
+    def __init__(self, message: str, notable: bool = True) -> None:
+        super().__init__(message)
+        self.notable = notable
 
 
 class KnownEnvironment(NamedTuple):
@@ -90,17 +90,17 @@ class Sample(NamedTuple):
     terminated: np.ndarray
 
 
-def recognize(wrapper: SnapshotEnvWrapper) -> KnownEnvironment | Refusal:
+def recognize(wrapper: SnapshotEnvWrapper) -> KnownEnvironment | NotRecognizedError:
     """Look at an environment and its wrappers.
 
     :param wrapper: the environment.
-    :return: what the batch model needs, or why it cannot simulate this environment.
+    :return: what the batch model needs, or the error that says why it cannot simulate this environment.
     :raises SnapshotUnsupportedError: if its snapshots are not exact.
     """
     env: Any = wrapper.unwrapped
     reason = _reason_against(wrapper)
     if reason:
-        return Refusal(reason, notable=isinstance(env, known_families()))
+        return NotRecognizedError(reason, notable=isinstance(env, known_families()))
     wrapper.verify()
     family = family_of(type(env))
     assert family is not None
