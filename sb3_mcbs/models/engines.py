@@ -1,7 +1,7 @@
 """Physics for many rows of one MuJoCo model.
 
 Both engines hold one integration state per row, in the layout of ``mjSTATE_INTEGRATION``, and give the same
-numbers as stepping an ``MjData`` of one's own.
+numbers as stepping a separate ``MjData``.
 """
 
 import copy

@@ -18,11 +18,11 @@ HIDDEN = (200, 200)
 LOG_VARIANCES = (-10.0, 1.0)
 BATCH_SIZE = 256
 LEARNING_RATE = 1e-3
-#: The held-out error is computed every so many gradient steps.
+#: Gradient steps between two computations of the held-out error.
 STEPS_PER_LOOK = 100
-#: A fit ends after so many held-out errors without an improvement.
+#: A fit ends after this number of held-out errors in a row without an improvement.
 PATIENCE = 3
-#: Statistics and held-out errors use at most so many rows, evenly spaced. More would hardly change them.
+#: Statistics and held-out errors use at most this many rows, evenly spaced. More would hardly change them.
 _STATISTICS_ROWS = 100_000
 _HELD_OUT_ROWS = 2_000
 #: A standard deviation below this, relative to the mean, is rounding noise of a constant.
@@ -144,14 +144,15 @@ class Ensemble:
         :param transitions: the real transitions.
         :return: the error, in the units of ``held_out_error``.
         """
+        return self._errors(transitions)[0]
+
+    def _errors(self, transitions: Transitions) -> tuple[float, float]:
+        """The error, and the share of terminations that are predicted wrongly."""
         predicted = self.predict(transitions.observations, transitions.actions)
-        difference = np.column_stack(
-            [
-                predicted.next_observations - transitions.next_observations,
-                predicted.rewards - transitions.rewards,
-            ]
-        )
-        return float(np.abs(difference / self._deviation).mean())
+        observations = predicted.next_observations - transitions.next_observations
+        difference = np.column_stack([observations, predicted.rewards - transitions.rewards])
+        wrong = predicted.terminated != (transitions.terminated > 0)
+        return float(np.abs(difference / self._deviation).mean()), float(wrong.mean())
 
     def fit(
         self, transitions: Transitions, held_out: np.ndarray, max_steps: int, rng: np.random.Generator
@@ -171,7 +172,7 @@ class Ensemble:
         self._normalise(transitions.take(_spaced(rows, _STATISTICS_ROWS)))
         terminates = self.predicts_termination = bool(transitions.terminated[rows].any())
         optimizer = th.optim.AdamW([self.parameters], lr=LEARNING_RATE, fused=True)
-        lowest, best, looks_without_gain = self._score(held), self.parameters.detach().clone(), 0
+        lowest, best, looks_without_gain = sum(self._errors(held)), self.parameters.detach().clone(), 0
         for step in range(1, max_steps + 1):
             drawn = rows[rng.integers(0, len(rows), (self.shape[0], BATCH_SIZE))]
             optimizer.zero_grad()
@@ -179,7 +180,7 @@ class Ensemble:
             optimizer.step()
             if step % STEPS_PER_LOOK and step < max_steps:
                 continue
-            score = self._score(held)
+            score = sum(self._errors(held))
             if score < lowest:
                 lowest, best, looks_without_gain = score, self.parameters.detach().clone(), 0
             else:
@@ -188,18 +189,11 @@ class Ensemble:
                     break
         with th.no_grad():
             self.parameters.copy_(best)
-        self.held_out_error, self.termination_error = self.error(held), self._termination_error(held)
+        self.held_out_error, self.termination_error = self._errors(held)
         never = float(np.mean(held.terminated > 0))
         if self.termination_error > never:
             # Weights that predict terminations worse than "never" would end simulations at random.
             self.predicts_termination, self.termination_error = False, never
-
-    def _score(self, held: Transitions) -> float:
-        return self.error(held) + self._termination_error(held)
-
-    def _termination_error(self, held: Transitions) -> float:
-        predicted = self.predict(held.observations, held.actions).terminated
-        return float(np.mean(predicted != (held.terminated > 0)))
 
     def _normalise(self, transitions: Transitions) -> None:
         self._obs_mean, self._obs_scale = _mean_and_scale(transitions.observations)
@@ -246,7 +240,7 @@ class Ensemble:
         targets = self._tensor((_targets(batch) - self._target_mean) / self._target_scale)
         likelihood = (means - targets) ** 2 * th.exp(-log_variances) + log_variances
         # Weighted by the standard deviation (Seitzer et al., 2022): the plain likelihood hardly learns the
-        # mean of targets that it calls noisy, and the mean is what is used.
+        # mean of targets that it considers noisy, and the predictions use the mean.
         loss = (likelihood * th.exp(0.5 * log_variances.detach())).mean(dim=(1, 2)).sum()
         if terminates:
             labels = self._tensor(batch.terminated)

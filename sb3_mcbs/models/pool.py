@@ -39,7 +39,7 @@ class EnvPoolModel(ForwardModel):
     :param environments: the real environments.
     :raises SnapshotUnsupportedError: if one of them cannot be copied exactly.
 
-    :ivar deterministic: found out by stepping copies; may be set to False by whoever knows better.
+    :ivar deterministic: found out by stepping copies. Set it to False if that missed random dynamics.
     """
 
     kind = "pool"
@@ -115,7 +115,7 @@ class EnvPoolModel(ForwardModel):
         )
 
     def refresh(self) -> None:
-        # New copies take over what the environments' simulators are now.
+        # New copies are made from the environments' present simulators.
         self.close()
         found = self._each(Copies.open, dict.fromkeys(range(len(self._environments)), ()))
         self._is_unknown = any(randomness is None for randomness in found)

@@ -34,7 +34,7 @@ _TRANSPARENT = {
     "stable_baselines3.common.monitor.Monitor",
 }
 
-#: The check makes so many rollouts of so many steps; rollout i starts after i * CHECK_SPACING random steps.
+#: Rollouts of the check, and steps of each; rollout i starts after i * CHECK_SPACING random steps.
 CHECK_ROLLOUTS, CHECK_STEPS, CHECK_SPACING = 4, 8, 9
 
 
@@ -53,7 +53,7 @@ class KnownEnvironment(NamedTuple):
     """What the batch model must know about one environment of a known family.
 
     :param env_class: its class.
-    :param constants: its model and attributes, as they are now.
+    :param constants: its present model and attributes.
     :param packed_model: the model as bytes, to be compared.
     """
 
@@ -160,7 +160,7 @@ def sample_transitions(wrapper: SnapshotEnvWrapper, state_size: int, lagging: Se
     :param wrapper: the environment, left as it is.
     :param state_size: size of its integration state.
     :param lagging: derived fields that belong to a root.
-    :return: what the copy did.
+    :return: the transitions of the copy.
     """
     rng = np.random.default_rng(0)
     copied = wrapper.clone()

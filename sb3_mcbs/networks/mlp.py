@@ -107,8 +107,8 @@ class MLP:
         is_activation = type(module) in (nn.ReLU, nn.Tanh) and self._layers
         if type(module) is not nn.Sequential and not is_activation:
             raise TypeError(
-                f"{type(module).__name__} is not covered; an MLP begins with Linear and goes on with Linear, "
-                "ReLU and Tanh"
+                f"{type(module).__name__} is not covered; an MLP begins with Linear and continues with "
+                "Linear, ReLU and Tanh"
             )
         state = own_state(module)
         if state["_parameters"] or (is_activation and state["_modules"]):
