@@ -18,7 +18,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from sb3_mcbs.agents.mcbs import MCBS
 from sb3_mcbs.agents.registry import ALGORITHMS
 from sb3_mcbs.loading.agent_file import AgentFile, is_pickled, read_agent_file
-from sb3_mcbs.loading.architecture import Architecture, check_shapes, check_spaces, read_architecture
+from sb3_mcbs.loading.architecture import Architecture, check_spaces, read_architecture
 from sb3_mcbs.loading.archive import AgentFileError, about
 from sb3_mcbs.loading.network_settings import is_number, network_settings
 from sb3_mcbs.search import SearchSettings
@@ -65,8 +65,7 @@ def load_agent(
     file = read_agent_file(path)
     with about(file.path):
         shapes = {name: tuple(tensor.shape) for name, tensor in file.tensors.items()}
-        architecture = read_architecture(shapes)
-        check_shapes(shapes, architecture, env.observation_space, env.action_space)
+        architecture = read_architecture(shapes, env.observation_space, env.action_space)
         name = _algorithm(file, architecture, algo)
         networks = network_settings(file.data, architecture, policy_kwargs)
         if issubclass(ALGORITHMS[name], TQC):

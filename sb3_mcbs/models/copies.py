@@ -181,7 +181,7 @@ class Copies:
                 if not source.last.ended:
                     if number not in snapshots:
                         snapshots[number] = source.env.snapshot()
-                    row.start(snapshots[number], self._rng)
+                    row.env.restore(snapshots[number], rng=self._rng)
                 row.last = source.last
             chosen.append(row)
         self.rows = chosen
