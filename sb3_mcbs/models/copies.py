@@ -19,7 +19,7 @@ from sb3_mcbs.snapshot import (
     SnapshotMismatchError,
 )
 from sb3_mcbs.snapshot.generators import isolated_globals
-from sb3_mcbs.types import ForwardModelError
+from sb3_mcbs.types import ForwardModelError, map_arrays
 
 
 def _blank(space: spaces.Space) -> Any:
@@ -89,11 +89,7 @@ class _Row:
         except Exception as error:
             self.last = self.last._replace(reward=0.0, valid=False)
             return error
-        if isinstance(observation, dict):
-            observation = {key: np.array(value) for key, value in observation.items()}
-        else:
-            observation = np.array(observation)
-        reward = float(reward)
+        observation, reward = map_arrays(np.array, observation), float(reward)
         valid = _is_finite(observation) and bool(np.isfinite(reward)) and SIMULATION_DIVERGED not in info
         # A time limit does not end a simulation. An environment that ends an episode itself may not go on.
         stopped = bool(truncated) and valid and not _is_at_time_limit(self.env)

@@ -164,7 +164,7 @@ def sample_transitions(wrapper: SnapshotEnvWrapper, state_size: int, lagging: Se
     """
     rng = np.random.default_rng(0)
     copied = wrapper.clone()
-    records: list[list[Any]] = [[], [], [], [], []]
+    steps: list[tuple[Any, ...]] = []
     try:
         for rollout in range(CHECK_ROLLOUTS):
             # The first rollout starts from the environment's present state, unless it was never reset.
@@ -176,10 +176,8 @@ def sample_transitions(wrapper: SnapshotEnvWrapper, state_size: int, lagging: Se
                 action = random_action(copied.action_space, rng)
                 root = read_root(copied, state_size, lagging)
                 observation, reward, terminated, _, _ = copied.step(action)
-                results = (root, action, np.array(observation), np.float64(reward), bool(terminated))
-                for record, result in zip(records, results, strict=True):
-                    record.append(result)
+                steps.append((root, action, np.array(observation), np.float64(reward), bool(terminated)))
     finally:
         copied.close()
-    arrays = [np.stack(record) for record in records]
+    arrays = [np.stack(values) for values in zip(*steps, strict=True)]
     return Sample(*(array.reshape(CHECK_ROLLOUTS, CHECK_STEPS, *array.shape[1:]) for array in arrays))

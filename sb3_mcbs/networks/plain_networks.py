@@ -133,7 +133,7 @@ def critic_mlps(critic: Any) -> list[MLP]:
     return [MLP(network) for network in critic.q_networks]
 
 
-def parameters_of(network: Any, mlps: list[MLP]) -> list[nn.Parameter]:
+def parameters_of(network: Any, mlps: list[MLP]) -> list[th.Tensor]:
     """The parameters of a TD3 actor or of a critic.
 
     :param network: the actor or critic.
@@ -149,7 +149,7 @@ def parameters_of(network: Any, mlps: list[MLP]) -> list[nn.Parameter]:
     return [parameter for mlp in mlps for parameter in mlp.parameters]
 
 
-def check_trained(network: Any, parameters: list[nn.Parameter]) -> None:
+def check_trained(network: Any, parameters: list[th.Tensor]) -> None:
     """Refuse to train a network that needs more than plain Adam steps on its gradients.
 
     :param network: the actor or critic, with its optimizer.

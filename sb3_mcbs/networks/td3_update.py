@@ -8,7 +8,7 @@ to float32 rounding.
 
 import logging
 from collections.abc import Collection
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch as th
@@ -18,7 +18,6 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.td3 import td3 as td3_module
 from torch.nn import functional as F
 
-from sb3_mcbs.networks.mlp import MLP
 from sb3_mcbs.networks.plain_networks import (
     actor_mlp,
     check_trained,
@@ -44,10 +43,12 @@ class TD3Update:
 
     def __init__(self, agent: TD3) -> None:
         self._agent = agent
-        self._actor, actor = _actor_and_parameters(agent.actor)
-        self._actor_target, actor_target = _actor_and_parameters(agent.actor_target)
-        self._critics, critic = _critics_and_parameters(agent.critic)
-        self._critic_targets, critic_target = _critics_and_parameters(agent.critic_target)
+        self._actor, self._actor_target = actor_mlp(agent.actor), actor_mlp(agent.actor_target)
+        self._critics, self._critic_targets = critic_mlps(agent.critic), critic_mlps(agent.critic_target)
+        actor = parameters_of(agent.actor, [self._actor])
+        actor_target = parameters_of(agent.actor_target, [self._actor_target])
+        critic = parameters_of(agent.critic, self._critics)
+        critic_target = parameters_of(agent.critic_target, self._critic_targets)
         check_trained(agent.actor, actor)
         check_trained(agent.critic, critic)
         if len({*map(id, actor), *map(id, critic)}) != len(actor) + len(critic):
@@ -164,7 +165,7 @@ class FastUpdate(TD3):
     """
 
     #: What neither ``save`` nor an exact checkpoint contains, and why.
-    not_checkpointed: ClassVar[Collection[str]] = {"_reasons_said": "what the user of this process was told"}
+    not_checkpointed: ClassVar[Collection[str]] = {"_reasons_said": "messages to the user of this process"}
     #: ``False`` leaves gradient steps to SB3.
     fast_update: bool
     #: The messages that said why gradient steps were left to SB3.
@@ -213,16 +214,6 @@ class FastUpdate(TD3):
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), *FastUpdate.not_checkpointed]
-
-
-def _actor_and_parameters(actor: Any) -> tuple[MLP, list[Any]]:
-    mlp = actor_mlp(actor)
-    return mlp, parameters_of(actor, [mlp])
-
-
-def _critics_and_parameters(critic: Any) -> tuple[list[MLP], list[Any]]:
-    mlps = critic_mlps(critic)
-    return mlps, parameters_of(critic, mlps)
 
 
 def _pairs(observations: th.Tensor, actions: th.Tensor) -> th.Tensor:
