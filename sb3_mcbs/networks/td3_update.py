@@ -179,7 +179,7 @@ class FastUpdate(TD3):
     def _make_update(self) -> TD3Update:
         check_unreplaced(_CALLED)
         if getattr(super().train, "__func__", None) is not _SB3S_TRAIN:
-            raise TypeError("a class of the agent's has a train of its own")
+            raise TypeError("a class of the agent overrides train")
         return TD3Update(self)
 
     def _present_update(self) -> TD3Update | None:
