@@ -192,7 +192,7 @@ def ending(agent: OffPolicyAlgorithm, folder: Path) -> dict[str, np.ndarray]:
         result["logarithm of the entropy coefficient"] = _digest(agent.log_ent_coef.detach())
     if getattr(agent, "learned_model", None) is not None:
         ensemble = agent.learned_model.ensemble  # type: ignore[attr-defined]
-        result["learned model"] = _digest(ensemble._network.parameters.detach())
+        result["learned model"] = _digest(ensemble.parameters.detach())
         result["held-out error"] = np.array(ensemble.held_out_error)
     assert agent.replay_buffer is not None
     for name, value in vars(agent.replay_buffer).items():

@@ -15,7 +15,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_mcbs import MCBS, MCBSDDPG, MCBSSAC, MCBSTD3, MCBSTQC, SnapshotEnvWrapper
 from sb3_mcbs.agents import learned_model
-from sb3_mcbs.models import ensemble, ensemble_network
+from sb3_mcbs.models import ensemble
 from sb3_mcbs.snapshot import registry, verification
 
 # Small networks are fastest on one thread, and idle OpenMP threads would take cores from the simulations.
@@ -95,7 +95,7 @@ def nothing_has_passed(monkeypatch: pytest.MonkeyPatch) -> None:
 def small_ensembles() -> Iterator[None]:
     """Learned models with networks that are fitted in no time."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ensemble_network, "HIDDEN", (24, 24))
+        patch.setattr(ensemble, "HIDDEN", (24, 24))
         patch.setattr(ensemble, "BATCH_SIZE", 64)
         patch.setattr(learned_model, "LEAST_TRANSITIONS", 100)
         yield

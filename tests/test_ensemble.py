@@ -52,7 +52,7 @@ def test_a_linear_system_is_learned(linear):
 def test_the_error_is_1_for_who_predicts_the_mean():
     transitions = random_transitions(2000)
     ensemble = fitted(transitions, steps=1)
-    flat = ensemble._network.parameters
+    flat = ensemble.parameters
     with th.no_grad():
         flat.zero_()
     assert ensemble.error(transitions) == pytest.approx(1, abs=0.02)
@@ -86,7 +86,7 @@ def test_a_fit_never_makes_the_held_out_error_worse_and_is_reproducible(linear):
     transitions = random_transitions(2000)
     held_out = np.arange(2000) % 10 == 9
     again = fitted(transitions)
-    np.testing.assert_array_equal(*(e._network.parameters.detach() for e in (linear, again)))
+    np.testing.assert_array_equal(*(e.parameters.detach() for e in (linear, again)))
     for step in range(3):
         before = again.held_out_error
         again.fit(transitions, held_out, 7, np.random.default_rng(step))

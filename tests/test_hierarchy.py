@@ -17,7 +17,7 @@ from sb3_mcbs.search import (
 )
 from sb3_mcbs.search.cem import cem_search, draw_plan_noise, first_spread
 from sb3_mcbs.search.deadline import LatencyForecast
-from sb3_mcbs.search.directions import ENOUGH, RECENT, low_dimensional
+from sb3_mcbs.search.proposals import ENOUGH, RECENT, low_dimensional
 from sb3_mcbs.search.tree import draw_tree_noise, tree_search
 from tests import reference_strategies
 from tests.checkpoint_helpers import assert_resumed_is_exact

@@ -240,8 +240,8 @@ def test_a_resumed_run_is_exact(make_agent, tmp_path, n_envs, crash_at):
     assert ours.rng.bit_generator.state == theirs.rng.bit_generator.state
     assert ours._fitted_at == theirs._fitted_at > crash_at
     for name, value in vars(ours.ensemble).items():
-        if name == "_network":
-            value, other = (e._network.parameters.detach() for e in (ours.ensemble, theirs.ensemble))
+        if name == "parameters":
+            value, other = (e.parameters.detach() for e in (ours.ensemble, theirs.ensemble))
         else:
             other = vars(theirs.ensemble)[name]
         np.testing.assert_array_equal(value, other, err_msg=name)

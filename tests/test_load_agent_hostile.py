@@ -160,7 +160,7 @@ def test_missing_members(saved, tmp_path):
     for name in ("data", "policy.pth"):
         members = files.members_of(path)
         del members[name]
-        with pytest.raises(AgentFileError, match=rf"missing\.zip is no SB3 model file.*'{name}'"):
+        with pytest.raises(AgentFileError, match=rf"missing\.zip: this is no SB3 model file.*'{name}'"):
             load(files.write(tmp_path / "missing.zip", members))
 
 

@@ -1,13 +1,14 @@
-"""The settings of the search, and of what is learned from it, as parameters of constructors."""
+"""The settings of the search, and of what is learned from it: parameters of constructors, then attributes."""
 
 from collections.abc import Mapping
+from copy import deepcopy
 from dataclasses import fields
 from typing import Any, Self
 
 from sb3_mcbs.agents.learned_model import EnsembleSettings
 from sb3_mcbs.agents.schedule import ScheduleSettings
 from sb3_mcbs.agents.value_expansion import ValueExpansionSettings
-from sb3_mcbs.search import BeamSettings, make_settings, with_preset
+from sb3_mcbs.search import BeamSettings, SearchSettings, make_settings, with_preset
 from sb3_mcbs.search.checks import as_dict
 from sb3_mcbs.search.settings import OF_THE_MACHINE, STRATEGIES, present_name
 
@@ -182,3 +183,122 @@ def settings_of_preset(name: str) -> dict[str, Any]:
             settings |= defaults.grouped()
         settings["action_noise_after_search"] = False
     return settings
+
+
+class SearchAttributes(RefusesOldNames):
+    """:data:`~sb3_mcbs.agents.hyperparameters.SETTINGS` as attributes of an agent.
+
+    Once the agent is set up, they are checked when they are set, together with all others, and hold from the
+    next decision on::
+
+        agent.beam_width = 20
+        agent.search_kwargs = {"antithetic": True}
+        agent.search_settings = TreeSettings(beam_width=4, branching=3)
+        agent.preset = "balanced"
+
+    ``agent.search_kwargs["antithetic"] = True`` is noticed, and checked, at the next decision.
+    """
+
+    beam_width: int
+    rollout_depth: int
+    n_simulations: int
+    beam_noise: float
+    strategy: str
+    search_kwargs: dict[str, Any] | None
+    preset: str | None
+    search_schedule: str
+    search_share: float
+    search_unit: str
+    schedule_kwargs: dict[str, Any] | None
+    forward_model: str
+    model_kwargs: dict[str, Any] | None
+    value_expansion: int
+    expanded_share: float
+    action_noise_after_search: bool
+    matmul_precision: str | None
+    #: What the dictionaries contained when they were last checked.
+    _followed: list[dict[str, Any] | None]
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name in REMOVED or name in MOVED:
+            refuse_old_names({name: value})
+        if name not in SETTINGS or not self._is_set_up:
+            super().__setattr__(name, value)
+        elif hasattr(type(self), name):  # a property of a class of the user's
+            super().__setattr__(name, value)
+            self._follow_settings()
+        elif name == "preset" and value is not None:
+            self._change_settings({**settings_of_preset(value), name: value})
+        else:
+            self._change_settings({name: value})
+
+    @property
+    def search_settings(self) -> SearchSettings:
+        """The settings of the search, checked. Another object changes them all at once."""
+        return SearchSettings.of(self)
+
+    @search_settings.setter
+    def search_settings(self, settings: SearchSettings) -> None:
+        if not isinstance(settings, SearchSettings):
+            raise TypeError(f"Expected BeamSettings, TreeSettings or CEMSettings, got {settings!r}.")
+        changes = settings.grouped()
+        learned = {key: value for key, value in (self.model_kwargs or {}).items() if key != "n_threads"}
+        changes["model_kwargs"] = {**learned, **(changes["model_kwargs"] or {})} or None
+        self._change_settings(changes)
+
+    @property
+    def schedule_settings(self) -> ScheduleSettings:
+        """The settings of the search's schedule, checked. Another object changes them all at once."""
+        return ScheduleSettings.of(self)
+
+    @schedule_settings.setter
+    def schedule_settings(self, settings: ScheduleSettings) -> None:
+        if not isinstance(settings, ScheduleSettings):
+            raise TypeError(f"Expected ScheduleSettings, got {settings!r}.")
+        self._change_settings(settings.grouped())
+
+    def _change_settings(self, changes: dict[str, Any]) -> None:
+        """Change settings and have everything follow, or leave all as it was.
+
+        :param changes: new values by name.
+        :raises TypeError: if a value has the wrong type.
+        :raises ValueError: if a value is out of range or does not go with the others.
+        """
+        attributes = vars(self)
+        changes = tidied(changes)
+        before = {name: attributes[name] for name in changes if name in attributes}
+        attributes.update(changes)
+        try:
+            self._follow_settings()
+        except Exception:
+            for name in changes:
+                del attributes[name]
+            attributes.update(before)
+            self._follow_settings()
+            raise
+
+    def _note_dictionaries(self) -> None:
+        """Remember what the dictionaries contain, which was checked."""
+        vars(self)["_followed"] = deepcopy([getattr(self, group) for group in GROUPS])
+        own = {"strategy": self.strategy, "search_kwargs": self.search_kwargs}
+        if with_preset(self.preset, own)["search_kwargs"] != self.search_kwargs:
+            # An agent that is made with the same arguments would have what was taken from the preset.
+            vars(self)["preset"] = None
+
+    def _follow_dictionaries(self) -> None:
+        """Follow what was changed within the dictionaries since they were last checked."""
+        if [getattr(self, group) for group in GROUPS] != self._followed:
+            self._follow_settings()
+
+    @property
+    def _is_set_up(self) -> bool:
+        """Whether settings that change have to be followed."""
+        raise NotImplementedError
+
+    def _follow_settings(self) -> None:
+        """Search with the present settings from the next decision on.
+
+        :raises TypeError: if a value has the wrong type.
+        :raises ValueError: if a value is out of range or does not go with the others.
+        """
+        raise NotImplementedError

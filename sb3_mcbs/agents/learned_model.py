@@ -9,8 +9,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.preprocessing import get_action_dim
 
-from sb3_mcbs.models.ensemble import Ensemble, Transitions
-from sb3_mcbs.models.ensemble_model import check_observation_space
+from sb3_mcbs.models.ensemble import Ensemble, Transitions, check_observation_space
 from sb3_mcbs.search.checks import CheckedSettings, known_keys
 from sb3_mcbs.search.random_streams import spawn_rng
 

@@ -12,15 +12,14 @@ from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_mcbs.agents.attributes import SearchAttributes
 from sb3_mcbs.agents.decision_log import record_decision
-from sb3_mcbs.agents.expanding import Expanding
 from sb3_mcbs.agents.exploration import DrawnNoise, noise_without_search
 from sb3_mcbs.agents.faults import environment_named
 from sb3_mcbs.agents.hyperparameters import (
     GROUPS,
     MOVED,
     SETTINGS,
+    SearchAttributes,
     complete_settings,
     convert_older,
     refuse_old_names,
@@ -37,6 +36,7 @@ from sb3_mcbs.agents.planner import Planner
 from sb3_mcbs.agents.resumable import Resumable, Searching
 from sb3_mcbs.agents.roots import EnvironmentStep, Prediction
 from sb3_mcbs.agents.schedule import ScheduleSettings, SearchSchedule
+from sb3_mcbs.agents.value_expansion import Expanding
 from sb3_mcbs.networks.torch_settings import matmul_precision
 from sb3_mcbs.search import RecentActions, SearchResult, SearchSettings
 from sb3_mcbs.search.random_streams import spawn_rng

@@ -17,8 +17,7 @@ from sb3_mcbs.agents.observation_pipeline import (
     snapshot_environments,
 )
 from sb3_mcbs.models import ForwardModelError, make_forward_model
-from sb3_mcbs.models.ensemble import Transitions
-from sb3_mcbs.models.ensemble_model import EnsembleModel
+from sb3_mcbs.models.ensemble import EnsembleModel, Transitions
 from sb3_mcbs.search import EpisodeClock, FirstStep, Roots, SearchResult, SearchSettings, check_dynamics
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 from sb3_mcbs.types import ForwardModel, Observations, difference, equal, row_of, stack, take_rows

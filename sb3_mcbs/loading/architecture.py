@@ -1,7 +1,7 @@
-"""The networks of an SB3 policy, told from the names and shapes of its parameters."""
+"""Infers the networks of an SB3 policy from the names and shapes of its parameters."""
 
 import itertools
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,7 +25,7 @@ class Architecture:
     :param n_critics: how many critics there are.
     :param n_outputs: a critic's outputs; with several they are quantiles (TQC).
     :param use_sde: whether the exploration depends on the state (gSDE).
-    :param clips_mean: whether the actor clips its mean before it is squashed; only with gSDE.
+    :param clips_mean: whether the actor clips its mean before squashing it; only with gSDE.
     """
 
     stochastic: bool
@@ -36,70 +36,65 @@ class Architecture:
     use_sde: bool
     clips_mean: bool
 
-    def shapes(self, n_features: int, n_actions: int) -> dict[str, Shape]:
-        """All parameters that an SB3 policy of this architecture has.
 
-        :param n_features: numbers in an observation.
-        :param n_actions: numbers in an action.
-        :return: shapes by name.
-        """
-        shapes: dict[str, Shape] = {}
-        if self.stochastic:
-            shapes |= self._stochastic_actor(n_features, n_actions)
-        else:
-            for actor in ("actor", "actor_target"):
-                shapes |= _layers(f"{actor}.mu", [n_features, *self.actor, n_actions])
-        critic = [n_features + n_actions, *self.critic, self.n_outputs]
-        for name, index in itertools.product(("critic", "critic_target"), range(self.n_critics)):
-            shapes |= _layers(f"{name}.qf{index}", critic)
-        return shapes
+def check_spaces(observation_space: spaces.Space, action_space: spaces.Space) -> None:
+    """Refuse an environment that an MLP agent cannot act in.
 
-    def _stochastic_actor(self, n_features: int, n_actions: int) -> dict[str, Shape]:
-        latent = [n_features, *self.actor]
-        last = [latent[-1], n_actions]
-        shapes = _layers("actor.latent_pi", latent)
-        if not self.use_sde:
-            return shapes | _linear("actor.mu", *last) | _linear("actor.log_std", *last)
-        mean = "actor.mu.0" if self.clips_mean else "actor.mu"
-        return shapes | _linear(mean, *last) | {"actor.log_std": tuple(last)}
-
-
-def _linear(name: str, n_inputs: int, n_outputs: int) -> dict[str, Shape]:
-    return {f"{name}.weight": (n_outputs, n_inputs), f"{name}.bias": (n_outputs,)}
-
-
-def _layers(prefix: str, widths: list[int]) -> dict[str, Shape]:
-    shapes: dict[str, Shape] = {}
-    for index, (n_inputs, n_outputs) in enumerate(itertools.pairwise(widths)):
-        # Every second module is an activation function, which has no parameters.
-        shapes |= _linear(f"{prefix}.{2 * index}", n_inputs, n_outputs)
-    return shapes
-
-
-def _widths(shapes: Mapping[str, Shape], prefix: str) -> Iterator[int]:
-    for index in itertools.count(0, 2):
-        shape = shapes.get(f"{prefix}.{index}.weight")
-        if not shape:
-            return
-        yield shape[0]
-
-
-def read_architecture(shapes: Mapping[str, Shape]) -> Architecture:
-    """Tell the architecture from parameters that may not fit together; :func:`check_shapes` finds that.
-
-    :param shapes: shapes by name.
-    :return: what the names and the output sizes say.
-    :raises AgentFileError: if they are not those of an actor and critics that are MLPs.
+    :param observation_space: its observations.
+    :param action_space: its actions.
+    :raises ValueError: if observations are images, a Dict or a Tuple, or actions are not a Box.
     """
+    if isinstance(observation_space, spaces.Dict | spaces.Tuple) or is_image_space(observation_space):
+        raise ValueError(
+            "load_agent reads agents with an MlpPolicy, whose observations are vectors; the environment's "
+            f"are {observation_space}. {_USE_SB3}"
+        )
+    if not isinstance(action_space, spaces.Box):
+        raise ValueError(f"The agent needs continuous (Box) actions, the environment has {action_space}.")
+
+
+def read_architecture(
+    shapes: Mapping[str, Shape], observation_space: spaces.Space, action_space: Any
+) -> Architecture:
+    """Infer the architecture, and check that every parameter fits it and the environment.
+
+    :param shapes: the file's shapes by name.
+    :param observation_space: the environment's observations.
+    :param action_space: the environment's actions.
+    :return: the architecture.
+    :raises AgentFileError: if the parameters are not those of an actor and critics that are MLPs, or if one
+        is missing, left over or of another shape.
+    """
+    architecture = _infer(shapes)
+    n_features, n_actions = get_flattened_obs_dim(observation_space), get_action_dim(action_space)
+    expected = _expected_shapes(architecture, n_features, n_actions)
+    for name in sorted(expected.keys() | shapes.keys()):
+        if name not in shapes:
+            raise AgentFileError(f"The policy's tensor {name!r} is missing, the file is not complete.")
+        if name not in expected:
+            raise AgentFileError(
+                f"The policy has a tensor {name[:80]!r} that SB3's MlpPolicy does not have. {_USE_SB3}"
+            )
+        if shapes[name] != expected[name]:
+            raise AgentFileError(
+                f"Tensor {name!r} has the shape {shapes[name]}, but {expected[name]} is needed: for the "
+                f"environment's observations {observation_space.shape} and actions {action_space.shape}, and "
+                "for the layers beside it. Is it the environment that the agent was trained in?"
+            )
+    return architecture
+
+
+def _infer(shapes: Mapping[str, Shape]) -> Architecture:
+    """Infer the architecture from names and output sizes, which may contradict other shapes."""
     for name in shapes:
         if "features_extractor" in name:
             raise AgentFileError(
                 f"The policy extracts features ({name[:80]!r}), as CnnPolicy and MultiInputPolicy do; only "
-                f"the networks of an MlpPolicy can be told from a file's tensors. {_USE_SB3}"
+                f"the networks of an MlpPolicy can be inferred from a file's tensors. {_USE_SB3}"
             )
     stochastic = any(name.startswith("actor.log_std") for name in shapes)
-    actor = list(_widths(shapes, "actor.latent_pi" if stochastic else "actor.mu"))
-    critic = list(_widths(shapes, "critic.qf0"))
+    actor = _widths(shapes, "actor.latent_pi" if stochastic else "actor.mu")
+    critic = _widths(shapes, "critic.qf0")
     if not critic or not (actor or stochastic):
         raise AgentFileError(
             "The policy's tensors are not those of a TD3, DDPG, SAC or TQC agent: these have "
@@ -117,47 +112,39 @@ def read_architecture(shapes: Mapping[str, Shape]) -> Architecture:
     )
 
 
-def check_spaces(observation_space: spaces.Space, action_space: spaces.Space) -> None:
-    """Refuse an environment that an MLP agent cannot act in.
-
-    :param observation_space: its observations.
-    :param action_space: its actions.
-    :raises ValueError: if observations are images or of several inputs, or actions not a Box.
-    """
-    if isinstance(observation_space, spaces.Dict | spaces.Tuple) or is_image_space(observation_space):
-        raise ValueError(
-            "load_agent reads agents with an MlpPolicy, whose observations are vectors; the environment's "
-            f"are {observation_space}. {_USE_SB3}"
-        )
-    if not isinstance(action_space, spaces.Box):
-        raise ValueError(f"The agent needs continuous (Box) actions, the environment has {action_space}.")
+def _widths(shapes: Mapping[str, Shape], prefix: str) -> list[int]:
+    weights = (shapes.get(f"{prefix}.{index}.weight") for index in itertools.count(0, 2))
+    return [shape[0] for shape in itertools.takewhile(bool, weights) if shape]
 
 
-def check_shapes(
-    shapes: Mapping[str, Shape],
-    architecture: Architecture,
-    observation_space: spaces.Space,
-    action_space: Any,
-) -> None:
-    """Refuse parameters that do not fit together, or not the environment.
+def _expected_shapes(architecture: Architecture, n_features: int, n_actions: int) -> dict[str, Shape]:
+    """The shapes of all parameters that an SB3 policy of this architecture has, by name."""
+    shapes: dict[str, Shape] = {}
+    if architecture.stochastic:
+        latent = [n_features, *architecture.actor]
+        last = (latent[-1], n_actions)
+        shapes |= _layers("actor.latent_pi", latent)
+        if architecture.use_sde:
+            mean = "actor.mu.0" if architecture.clips_mean else "actor.mu"
+            shapes |= _linear(mean, *last) | {"actor.log_std": last}
+        else:
+            shapes |= _linear("actor.mu", *last) | _linear("actor.log_std", *last)
+    else:
+        for actor in ("actor", "actor_target"):
+            shapes |= _layers(f"{actor}.mu", [n_features, *architecture.actor, n_actions])
+    critic = [n_features + n_actions, *architecture.critic, architecture.n_outputs]
+    for name, index in itertools.product(("critic", "critic_target"), range(architecture.n_critics)):
+        shapes |= _layers(f"{name}.qf{index}", critic)
+    return shapes
 
-    :param shapes: the file's shapes by name.
-    :param architecture: what was told from them.
-    :param observation_space: the environment's observations.
-    :param action_space: the environment's actions.
-    :raises AgentFileError: if a parameter is missing, left over or of another shape.
-    """
-    expected = architecture.shapes(get_flattened_obs_dim(observation_space), get_action_dim(action_space))
-    for name in sorted(expected.keys() | shapes.keys()):
-        if name not in shapes:
-            raise AgentFileError(f"The policy's tensor {name!r} is missing, the file is not complete.")
-        if name not in expected:
-            raise AgentFileError(
-                f"The policy has a tensor {name[:80]!r} that SB3's MlpPolicy does not have. {_USE_SB3}"
-            )
-        if shapes[name] != expected[name]:
-            raise AgentFileError(
-                f"Tensor {name!r} has the shape {shapes[name]}, but {expected[name]} is needed: for the "
-                f"environment's observations {observation_space.shape} and actions {action_space.shape}, and "
-                "for the layers beside it. Is it the environment that the agent was trained in?"
-            )
+
+def _linear(name: str, n_inputs: int, n_outputs: int) -> dict[str, Shape]:
+    return {f"{name}.weight": (n_outputs, n_inputs), f"{name}.bias": (n_outputs,)}
+
+
+def _layers(prefix: str, widths: list[int]) -> dict[str, Shape]:
+    shapes: dict[str, Shape] = {}
+    for index, (n_inputs, n_outputs) in enumerate(itertools.pairwise(widths)):
+        # Every second module is an activation function, which has no parameters.
+        shapes |= _linear(f"{prefix}.{2 * index}", n_inputs, n_outputs)
+    return shapes

@@ -1,10 +1,9 @@
-"""Loading an agent from a file whose author nobody knows."""
+"""Loads an agent from a file of an untrusted author."""
 
 import functools
 import logging
 import re
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -21,8 +20,8 @@ from sb3_mcbs.agents.learned_model import EnsembleSettings
 from sb3_mcbs.agents.mcbs import MCBS
 from sb3_mcbs.agents.registry import ALGORITHMS
 from sb3_mcbs.loading.agent_file import AgentFile, is_pickled, read_agent_file
-from sb3_mcbs.loading.architecture import Architecture, check_shapes, check_spaces, read_architecture
-from sb3_mcbs.loading.archive import AgentFileError
+from sb3_mcbs.loading.architecture import Architecture, check_spaces, read_architecture
+from sb3_mcbs.loading.archive import AgentFileError, about
 from sb3_mcbs.loading.network_settings import is_number, network_settings
 from sb3_mcbs.search import SearchSettings, make_settings
 
@@ -42,36 +41,36 @@ def load_agent(
     """
     Load an agent from an SB3 model file without running code from the file, to act (not to train).
 
-    SB3's ``load`` opens the pickles in the file, and that runs whatever their author wants. Here only tensors
-    and a few checked numbers are read: the networks' sizes and the algorithm are told from the tensors, the
-    spaces are those of ``env``. The agent can ``predict`` and be given to :class:`~sb3_mcbs.SearchPolicy`; it
-    has neither optimisers nor a replay buffer, so ``learn``, ``train`` and ``save`` refuse.
+    SB3's ``load`` opens the pickles in the file, which can run any code. This function reads only tensors and
+    a few checked numbers: it infers the networks' sizes and the algorithm from the tensors, and takes the
+    spaces from ``env``. The agent can ``predict`` and be given to :class:`~sb3_mcbs.SearchPolicy`; it has
+    neither optimisers nor a replay buffer, so ``learn``, ``train`` and ``save`` raise an error.
 
-    What was not taken over is listed in the agent's attribute ``not_taken_over``, a dictionary of reasons by
-    the name of the entry or member, and logged (``sb3_mcbs``); what may change how the agent acts, as a
-    warning.
+    The agent's attribute ``not_taken_over`` lists what was not taken over, a dictionary of reasons by the
+    name of the entry or member. It is also logged (``sb3_mcbs``), as a warning if it may change how the agent
+    acts.
 
     :param path: the file, as ``save`` of TD3, DDPG, SAC, TQC or one of their MCBS agents wrote it, with an
         ``MlpPolicy``
     :param env: the environment to act in; its spaces must be those of the training
-    :param algo: ``"td3"``, ``"ddpg"``, ``"sac"``, ``"tqc"``, or one of these after ``"mcbs_"``; None: as the
-        file says
-    :param policy_kwargs: what the agent was trained with, for files that do not say it readably. Needed is
-        what tensors do not tell: ``activation_fn``, with gSDE ``clip_mean`` and ``use_expln``.
+    :param algo: ``"td3"``, ``"ddpg"``, ``"sac"``, ``"tqc"``, or one of these after ``"mcbs_"``; by default
+        it is inferred from the file
+    :param policy_kwargs: those of the training, for files that hold no readable copy of them. Only those are
+        needed that cannot be inferred from tensors: ``activation_fn``, with gSDE ``clip_mean`` and
+        ``use_expln``.
     :param device: device on which the networks run
     :return: the agent, ready to act
     :raises FileNotFoundError: if there is no such file
     :raises AgentFileError: if the file is damaged, too large, of another kind or not for this environment
-    :raises ValueError: if ``algo`` or ``env`` cannot be used, or the file does not say something that
-        ``policy_kwargs`` must say
+    :raises ValueError: if ``algo`` or ``env`` cannot be used, or the file lacks settings that
+        ``policy_kwargs`` must give
     """
     env = maybe_make_env(env, verbose=0)
     check_spaces(env.observation_space, env.action_space)
     file = read_agent_file(path)
-    with _about(file.path):
+    with about(file.path):
         shapes = {name: tuple(tensor.shape) for name, tensor in file.tensors.items()}
-        architecture = read_architecture(shapes)
-        check_shapes(shapes, architecture, env.observation_space, env.action_space)
+        architecture = read_architecture(shapes, env.observation_space, env.action_space)
         name = _algorithm(file, architecture, algo)
         networks = network_settings(file.data, architecture, policy_kwargs)
         if issubclass(ALGORITHMS[name], TQC):
@@ -87,15 +86,6 @@ def load_agent(
     kind, activation = type(agent).__name__, networks["activation_fn"].__name__
     logger.info("%s: loaded as %s with %s. Not taken over: %s", file.path, kind, activation, list(left))
     return agent
-
-
-@contextmanager
-def _about(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except ValueError as reason:
-        kind = AgentFileError if isinstance(reason, AgentFileError) else ValueError
-        raise kind(f"{path}: {reason}") from reason
 
 
 def _algorithm(file: AgentFile, architecture: Architecture, algo: str | None) -> str:
@@ -127,7 +117,7 @@ def _is_entropy_coefficient(value: Any) -> bool:
 
 
 def _numbers(file: AgentFile, algo: str, architecture: Architecture) -> tuple[dict[str, Any], list[str]]:
-    """The numbers of the file that are taken over, by name, and warnings about those that cannot be."""
+    """The settings to take over from the file, by name, and warnings about those that cannot be."""
     checks: dict[str, tuple[Callable[[Any], bool], str]] = {
         "gamma": (lambda value: is_number(value) and 0 < value <= 1, "a number above 0 and up to 1")
     }
@@ -165,7 +155,7 @@ def _numbers(file: AgentFile, algo: str, architecture: Architecture) -> tuple[di
 
 
 def _differing_bounds(file: AgentFile, action_space: Any) -> list[str]:
-    """Compare the actions' bounds with the readable copy in the file, as far as that can be read."""
+    """Compare the action bounds with the readable copy in the file, as far as it can be parsed."""
     space = file.data.get("action_space")
     for name in ("low", "high"):
         text = str(space.get(name)) if isinstance(space, dict) else ""
@@ -183,11 +173,7 @@ def _differing_bounds(file: AgentFile, action_space: Any) -> list[str]:
 
 
 class NoOptimizer:
-    """Takes the place of an optimiser in the policy of an agent that only acts.
-
-    :param parameters: not used
-    :param lr: not used
-    """
+    """Replaces the optimiser in the policy of an agent that only acts."""
 
     def __init__(self, parameters: Any, lr: float) -> None:
         pass
@@ -211,7 +197,7 @@ def _build(
         _init_setup_model=False,
         **settings,
     )
-    # Initial weights, which are replaced, are no reason to advance the caller's random numbers.
+    # Drawing initial weights, which are replaced, must not advance the caller's random numbers.
     with th.random.fork_rng(devices=[]):
         policy = agent.policy_class(
             agent.observation_space, agent.action_space, lambda _: 0.0, **agent.policy_kwargs

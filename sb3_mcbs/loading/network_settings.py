@@ -1,4 +1,4 @@
-"""What a policy's tensors do not tell about it: activation functions, and gSDE's settings."""
+"""Policy settings that cannot be inferred from tensors: the activation function, and those of gSDE."""
 
 import re
 import sys
@@ -12,7 +12,7 @@ from sb3_mcbs.loading.agent_file import is_pickled
 from sb3_mcbs.loading.architecture import Architecture
 from sb3_mcbs.loading.archive import AgentFileError
 
-#: By the text that SB3 writes beside a pickled class.
+#: Activation functions by the text that SB3 writes beside a pickled class.
 ACTIVATIONS: dict[str, type[nn.Module]] = {
     str(cls): cls
     for cls in (
@@ -20,12 +20,12 @@ ACTIVATIONS: dict[str, type[nn.Module]] = {
     )
 }  # fmt: skip
 
-#: Arguments of SB3's policies that tensors tell, or that do not matter for vectors and for acting.
-_TOLD_OR_IDLE = {
+#: Arguments of SB3's policies. Most are inferred from tensors or have no effect on acting.
+_ARGUMENTS = {
     "net_arch", "n_critics", "n_quantiles", "use_sde", "log_std_init", "share_features_extractor",
     "normalize_images", "optimizer_class", "optimizer_kwargs", "features_extractor_kwargs", "device",
+    "activation_fn", "clip_mean", "use_expln", "features_extractor_class",
 }  # fmt: skip
-_ARGUMENTS = {*_TOLD_OR_IDLE, "activation_fn", "clip_mean", "use_expln", "features_extractor_class"}
 
 _POLICIES = {
     "stable_baselines3.td3.policies": "TD3Policy",
@@ -37,11 +37,7 @@ _SAY_IT = "Pass policy_kwargs= as it was trained with, for example policy_kwargs
 
 
 def is_number(value: Any) -> bool:
-    """Whether a value of the JSON is a finite number; its integers have no bound.
-
-    :param value: the value.
-    :return: whether it can be used as a float.
-    """
+    """Whether a value of the JSON is a number that fits into a float; JSON integers have no bound."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
@@ -51,11 +47,11 @@ def network_settings(
     """Arguments for the policy's constructor.
 
     :param data: the file's JSON entries; its readable copy of ``policy_kwargs`` is used, never the pickle.
-    :param architecture: what the tensors tell.
-    :param policy_kwargs: what the caller says; then the file is not asked.
+    :param architecture: inferred from the tensors.
+    :param policy_kwargs: given by the caller; then those of the file are ignored.
     :return: arguments of SB3's policy classes.
-    :raises AgentFileError: if the file says something that is out of range.
-    :raises ValueError: if the file does not say what is needed, or networks are not plain.
+    :raises AgentFileError: if a value in the file is out of range.
+    :raises ValueError: if the file lacks a setting, or the policy is not a plain MlpPolicy.
     """
     given = _readable_copy(data) if policy_kwargs is None else dict(policy_kwargs)
     unknown = sorted(str(name)[:40] for name in given.keys() - _ARGUMENTS)
@@ -76,10 +72,10 @@ def network_settings(
 
 
 def _readable_copy(data: Mapping[str, Any]) -> dict[str, Any]:
-    """The file's ``policy_kwargs``, complete, or an error that asks for them."""
+    """The file's ``policy_kwargs`` if they are complete; otherwise an error asks for them."""
     given, policy = data.get("policy_kwargs"), data.get("policy_class")
     policy = policy if isinstance(policy, dict) else {}
-    # A policy class of the author's own may have other defaults than SB3's.
+    # A custom policy class may have other defaults than SB3's.
     name = _POLICIES.get(str(policy.get("__module__")))
     if name is None or not re.match(rf"<function {name}\.__init__ at ", str(policy.get("__init__"))):
         raise ValueError(f"The file does not say that the policy is SB3's own MlpPolicy. {_SAY_IT}")
@@ -92,7 +88,7 @@ def _readable_copy(data: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _activation(given: Mapping[str, Any]) -> type[nn.Module]:
-    # SB3 writes every argument that was given, so one that is not there was SB3's default.
+    # SB3 writes every argument that was given, so a missing one has SB3's default.
     activation = given.get("activation_fn", nn.ReLU)
     if isinstance(activation, type) and issubclass(activation, nn.Module):
         return activation

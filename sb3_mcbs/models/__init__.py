@@ -2,8 +2,7 @@
 
 from sb3_mcbs.models import gymnasium_families as _families
 from sb3_mcbs.models import gymnasium_small_families as _small_families
-from sb3_mcbs.models.ensemble import Ensemble, Prediction, Transitions
-from sb3_mcbs.models.ensemble_model import EnsembleModel
+from sb3_mcbs.models.ensemble import Ensemble, EnsembleModel, Prediction, Transitions
 from sb3_mcbs.models.environments import Environments, LocalEnvironments, WorkerEnvironments
 from sb3_mcbs.models.factory import make_forward_model
 from sb3_mcbs.models.families import Constants, Family, Fields, Outcome, Rows, register_family

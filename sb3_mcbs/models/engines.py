@@ -1,11 +1,10 @@
 """Physics for many rows of one MuJoCo model.
 
-Both engines hold one integration state per row, in the layout of ``mjSTATE_INTEGRATION``, and give
-the same numbers as stepping an ``MjData`` of one's own.
+Both engines hold one integration state per row, in the layout of ``mjSTATE_INTEGRATION``, and give the same
+numbers as stepping a separate ``MjData``.
 """
 
 import copy
-import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -18,8 +17,8 @@ from sb3_mcbs.snapshot.mujoco import DIVERGENCE_WARNINGS
 
 INTEGRATION = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
-#: State components that a transition can read, and where they lie in a state row.
-_STATE_FIELDS = {
+#: ``MjData`` fields that are part of a state row. All others are computed by a step.
+STATE_FIELDS = {
     "time": mujoco.mjtState.mjSTATE_TIME,
     "qpos": mujoco.mjtState.mjSTATE_QPOS,
     "qvel": mujoco.mjtState.mjSTATE_QVEL,
@@ -30,31 +29,20 @@ _STATE_FIELDS = {
 }
 
 
-def available_cpus() -> int:
-    """How many processors this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
-def is_state_field(name: str) -> bool:
-    """Whether an ``MjData`` field is part of the state rows."""
-    return name in _STATE_FIELDS
-
-
 class Engine(ABC):
     """Rows of one model.
 
     :param model: copied; later edits of it are not seen.
     :param capacity: most rows that can be stepped at once.
     :param fields: the ``MjData`` fields that will be read.
+    :param n_threads: simulation threads, including the caller's.
 
     :ivar state: ``[capacity, nstate]``, writable.
     """
 
     state: np.ndarray
 
-    def __init__(self, model: mujoco.MjModel, capacity: int, fields: Sequence[str]) -> None:
+    def __init__(self, model: mujoco.MjModel, capacity: int, fields: Sequence[str], n_threads: int) -> None:
         self.model = copy.copy(model)
         self.capacity = capacity
         template = mujoco.MjData(self.model)
@@ -62,22 +50,24 @@ class Engine(ABC):
             if not isinstance(getattr(template, name, None), np.ndarray):
                 raise ValueError(f"{name!r} is not an array of MjData; a family's fields must be")
         self._shapes = {name: getattr(template, name).shape for name in fields}
-
-    def field(self, name: str) -> np.ndarray:
-        """``[capacity, ...]``, live: a state field to read and write, or the outcome of the last step."""
-        if not is_state_field(name):
-            return self._derived_field(name)
-        component = _STATE_FIELDS[name]
-        # Components lie in the order of their bits, so that all lower bits come before this one.
-        below = INTEGRATION & (int(component) - 1)
-        offset = mujoco.mj_stateSize(self.model, below) if below else 0
-        size = mujoco.mj_stateSize(self.model, int(component))
-        view = self.state[:, offset : offset + size]
-        return view[:, 0] if name == "time" else view.reshape(self.capacity, *self._shapes[name])
+        self._derived: dict[str, np.ndarray] = {}
+        self._set_up([name for name in fields if name not in STATE_FIELDS], n_threads)
 
     @abstractmethod
-    def _derived_field(self, name: str) -> np.ndarray:
-        """``[capacity, ...]`` of a field that a step computes."""
+    def _set_up(self, derived: list[str], n_threads: int) -> None:
+        """Make ``state``, and ``[capacity, ...]`` arrays for the fields that a step computes."""
+
+    def field(self, name: str) -> np.ndarray:
+        """``[capacity, ...]`` view: a state field to read and write, or a field of the last step."""
+        if name not in STATE_FIELDS:
+            return self._derived[name]
+        component = int(STATE_FIELDS[name])
+        # Components lie in the order of their bits, so that all lower bits come before this one.
+        below = INTEGRATION & (component - 1)
+        offset = mujoco.mj_stateSize(self.model, below) if below else 0
+        size = mujoco.mj_stateSize(self.model, component)
+        view = self.state[:, offset : offset + size]
+        return view[:, 0] if name == "time" else view.reshape(self.capacity, *self._shapes[name])
 
     @abstractmethod
     def step(self, rows: int, n_substeps: int) -> np.ndarray | None:
@@ -93,24 +83,14 @@ class Engine(ABC):
 
 
 class BatchEngine(Engine):
-    """MuJoCo's own batch: all in C++, but no contact forces (``cfrc_ext``).
+    """MuJoCo's own batch: all in C++, but no contact forces (``cfrc_ext``)."""
 
-    :param model: copied; later edits of it are not seen.
-    :param capacity: most rows that can be stepped at once.
-    :param fields: the ``MjData`` fields that will be read.
-    :param n_threads: simulation threads, the caller's included.
-    """
-
-    def __init__(self, model: mujoco.MjModel, capacity: int, fields: Sequence[str], n_threads: int) -> None:
-        super().__init__(model, capacity, fields)
-        self._batch = Batch(self.model, capacity, n_threads)
+    def _set_up(self, derived: list[str], n_threads: int) -> None:
+        self._batch = Batch(self.model, self.capacity, n_threads)
         self.state = self._batch.state
-        self._derived = {name: self._batch.bind(name) for name in fields if not is_state_field(name)}
-        self._ids = np.arange(capacity, dtype=np.int32)
+        self._derived = {name: self._batch.bind(name) for name in derived}
+        self._ids = np.arange(self.capacity, dtype=np.int32)
         self._warning = self._batch.warning[:, DIVERGENCE_WARNINGS, 1]
-
-    def _derived_field(self, name: str) -> np.ndarray:
-        return self._derived[name]
 
     def step(self, rows: int, n_substeps: int) -> np.ndarray | None:
         warning = self._warning[:rows]
@@ -129,34 +109,24 @@ class BatchEngine(Engine):
 
 
 class ThreadEngine(Engine):
-    """Real ``MjData`` on Python threads, for what ``mj_step`` alone does not compute.
+    """Real ``MjData`` on Python threads, for fields that ``mj_step`` alone does not compute.
 
-    After its substeps each row runs ``mj_rnePostConstraint``, as Gymnasium does. One ``MjData`` per
-    thread serves all rows: the state row is all that a step depends on.
-
-    :param model: copied; later edits of it are not seen.
-    :param capacity: most rows that can be stepped at once.
-    :param fields: the ``MjData`` fields that will be read.
-    :param n_threads: simulation threads, the caller's included.
+    After its substeps each row runs ``mj_rnePostConstraint``, as Gymnasium does. A step depends on nothing
+    but the state row, so one ``MjData`` per thread serves all rows.
     """
 
-    def __init__(self, model: mujoco.MjModel, capacity: int, fields: Sequence[str], n_threads: int) -> None:
-        super().__init__(model, capacity, fields)
+    def _set_up(self, derived: list[str], n_threads: int) -> None:
         # It refuses models whose rows cannot share an MjData, which holds here as well.
         Batch(self.model, 1, 1)
-        self.state = np.zeros((capacity, mujoco.mj_stateSize(self.model, INTEGRATION)))
-        derived = [name for name in fields if not is_state_field(name)]
-        self._derived = {name: np.zeros((capacity, *self._shapes[name])) for name in derived}
+        self.state = np.zeros((self.capacity, mujoco.mj_stateSize(self.model, INTEGRATION)))
+        self._derived = {name: np.zeros((self.capacity, *self._shapes[name])) for name in derived}
         self._datas = [mujoco.MjData(self.model) for _ in range(n_threads)]
         self._sources = [[(getattr(d, name), self._derived[name]) for name in derived] for d in self._datas]
-        self._diverged = np.zeros(capacity, dtype=bool)
+        self._diverged = np.zeros(self.capacity, dtype=bool)
         self._threads = ThreadPoolExecutor(n_threads - 1) if n_threads > 1 else None
 
-    def _derived_field(self, name: str) -> np.ndarray:
-        return self._derived[name]
-
     def step(self, rows: int, n_substeps: int) -> np.ndarray | None:
-        # The iterator is what the threads share: each takes the next row that nobody has.
+        # The threads share the iterator: each takes the next row.
         todo = iter(range(rows))
         helpers = []
         if self._threads is not None:
@@ -179,7 +149,7 @@ class ThreadEngine(Engine):
                 mujoco.mj_step(model, data, n_substeps)
                 mujoco.mj_rnePostConstraint(model, data)
             except mujoco.FatalError:
-                # The row keeps the state it had; what the data hold now is of no use to the next row.
+                # The row keeps the state it had, and the data are reset for the next row.
                 mujoco.mj_resetData(model, data)
                 self._diverged[row] = True
                 continue

@@ -1,4 +1,4 @@
-"""Where the real environments live, and how to run a function next to each of them."""
+"""Runs functions on the real environments, in the process where each of them lives."""
 
 import os
 import pickle
@@ -17,7 +17,7 @@ from sb3_mcbs.types import ForwardModelError
 
 _Call = tuple[Callable[..., Any], tuple[Any, ...]]
 
-# What workers have to do for objects of this process that are gone, once they are free to do it.
+# Calls that workers still have to make for objects of this process that were collected.
 _OVERDUE: WeakKeyDictionary[SubprocVecEnv, list[_Call]] = WeakKeyDictionary()
 
 
@@ -26,7 +26,7 @@ class WrappingError(ForwardModelError, ValueError):
 
 
 class Environments(ABC):
-    """The environments of a vectorized environment, wherever they run."""
+    """The environments of a vectorized environment, in this process or in workers."""
 
     @abstractmethod
     def __len__(self) -> int:
@@ -36,19 +36,18 @@ class Environments(ABC):
     def apply_each(
         self, env_indices: Sequence[int], function: Callable[..., Any], args_per_env: Sequence[Sequence[Any]]
     ) -> list[Any]:
-        """Run a function next to some environments, each with arguments of its own.
+        """Run a function in the process of each environment, with arguments for each.
 
         :param env_indices: which environments, each at most once.
         :param function: called as ``function(wrapper, *args)``, with the environment's
-            :class:`~sb3_mcbs.snapshot.SnapshotEnvWrapper`. It must be importable where the
-            environment lives.
+            :class:`~sb3_mcbs.snapshot.SnapshotEnvWrapper`. It must be importable in that process.
         :param args_per_env: the arguments for each of ``env_indices``.
         :return: the results, in the order of ``env_indices``.
         :raises WorkerError: if the worker process of an environment has ended.
         """
 
     def apply(self, env_indices: Sequence[int], function: Callable[..., Any], *args: Any) -> list[Any]:
-        """Run a function next to some environments, with the same arguments.
+        """Run a function in the process of each environment, with the same arguments.
 
         :param env_indices: which environments, each at most once.
         :param function: called as ``function(wrapper, *args)``.
@@ -58,11 +57,10 @@ class Environments(ABC):
 
     @abstractmethod
     def when_gone(self, owner: object, function: Callable[..., Any], *args: Any) -> None:
-        """Run a function next to every environment that is left when an object has been collected.
+        """Run a function on every environment once an object has been garbage-collected.
 
-        :param owner: the object. Neither it nor the environments live longer for this.
-        :param function: called as ``function(wrapper, *args)``; in worker processes not before the next
-            call that is for them.
+        :param owner: the object. Neither it nor the environments are kept alive.
+        :param function: called as ``function(wrapper, *args)``; worker processes run it at their next call.
         :param args: further arguments.
         """
 
@@ -96,7 +94,7 @@ class LocalEnvironments(Environments):
 
 
 class WorkerEnvironments(Environments):
-    """Environments in the worker processes of a ``SubprocVecEnv``, which work at the same time.
+    """Environments in the worker processes of a ``SubprocVecEnv``, which run in parallel.
 
     :param vec_env: the ``SubprocVecEnv``, or a wrapper around one. Each environment must have been
         wrapped in a :class:`~sb3_mcbs.snapshot.SnapshotEnvWrapper`, outermost, when its worker made it.
@@ -132,27 +130,33 @@ class WorkerEnvironments(Environments):
         return self._call(env_indices, function, args_per_env)
 
     def when_gone(self, owner: object, function: Callable[..., Any], *args: Any) -> None:
-        # Only noted: an object may be collected in the middle of a step, or of another call.
+        # Deferred, since an object may be collected in the middle of a step or of another call.
         finalize(owner, self._overdue.append, (function, args)).atexit = False
 
     def _call(
         self, env_indices: Sequence[int], function: Callable[..., Any], args_per_env: Sequence[Sequence[Any]]
     ) -> list[Any]:
         remotes = [self.vec_env.remotes[i] for i in env_indices]
-        # Packed here: what a worker cannot unpack would otherwise end the worker without a word.
+        # Pickled here, because a worker that cannot unpickle a command ends without a message.
         calls = [cloudpickle.dumps((function, tuple(args))) for args in args_per_env]
         try:
             for remote, call in zip(remotes, calls, strict=True):
                 remote.send(("env_method", ("apply", (_run_call, call), {})))
             await_answers(self.vec_env, env_indices)
-            # All answers are taken before any is judged, so that the pipes stay in step.
+            # All answers are received before any error is raised, so that none is left in a pipe.
             answers = [remote.recv() for remote in remotes]
         except (EOFError, OSError) as error:
             reason = worker_error(self.vec_env)
             if reason is None:
                 raise
             raise reason from error
-        return [self._unpack(i, answer) for i, answer in zip(env_indices, answers, strict=True)]
+        results = []
+        for env_index, answer in zip(env_indices, answers, strict=True):
+            raised, result, trace = pickle.loads(answer)
+            if raised is not None:
+                raise raised from RuntimeError(f"in the worker process of environment {env_index}:\n{trace}")
+            results.append(result)
+        return results
 
     @staticmethod
     def _check_available(vec_env: SubprocVecEnv) -> None:
@@ -163,20 +167,11 @@ class WorkerEnvironments(Environments):
                 "the workers are in the middle of a step: call step_wait() before looking ahead"
             )
 
-    @staticmethod
-    def _unpack(env_index: int, answer: bytes) -> Any:
-        error, result, trace = pickle.loads(answer)
-        if error is not None:
-            raise error from RuntimeError(f"in the worker process of environment {env_index}:\n{trace}")
-        return result
-
 
 class _OutermostIs:
-    """Stands in for a class in ``env_is_wrapped``, to ask for the outermost wrapper only.
+    """Makes ``env_is_wrapped`` look for a class in the outermost wrapper only.
 
-    A worker asks ``isinstance(layer, ...)`` of one layer after the other, outermost first.
-
-    :param cls: the class.
+    A worker calls ``isinstance(layer, ...)`` for each layer, outermost first.
     """
 
     def __init__(self, cls: type) -> None:
@@ -194,7 +189,7 @@ def _check_wrapping(vec_env: SubprocVecEnv) -> None:
     if not wrong:
         return
     somewhere = vec_env.env_is_wrapped(SnapshotEnvWrapper, wrong)
-    # Only those that have a wrapper can be asked for its name; the question would end the other workers.
+    # Asking a worker without the wrapper for its class_name would end that worker.
     others = [i for i, there in zip(wrong, somewhere, strict=True) if there]
     outer = dict(zip(others, vec_env.env_method("class_name", indices=others), strict=True))
     problems = []
@@ -226,19 +221,15 @@ def _call_alive(
 
 
 def _run_call(wrapper: SnapshotEnvWrapper, call: bytes) -> bytes:
-    """Run a packed call in a worker; pack its result, or its error, which must not end the worker."""
+    """Run a pickled call in a worker. An error is returned, since raising it would end the worker."""
     try:
         function, args = pickle.loads(call)
         return pickle.dumps((None, function(wrapper, *args), ""))
     except Exception as error:
         trace = traceback.format_exc()
         try:
-            return _checked(pickle.dumps((error, None, trace)))
+            answer = pickle.dumps((error, None, trace))
+            pickle.loads(answer)  # some exceptions can be pickled but not unpickled
+            return answer
         except Exception:
             return pickle.dumps((RuntimeError(f"{type(error).__name__}: {error}"), None, trace))
-
-
-def _checked(answer: bytes) -> bytes:
-    # Some exceptions can be packed but not unpacked.
-    pickle.loads(answer)
-    return answer

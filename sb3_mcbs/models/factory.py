@@ -3,8 +3,9 @@
 import logging
 
 from sb3_mcbs.models.environments import Environments
-from sb3_mcbs.models.mujoco_batch import MujocoBatchModel, NotRecognizedError
+from sb3_mcbs.models.mujoco_batch import MujocoBatchModel
 from sb3_mcbs.models.pool import EnvPoolModel
+from sb3_mcbs.models.recognition import NotRecognizedError
 from sb3_mcbs.types import BACKENDS, ForwardModelError
 
 logger = logging.getLogger("sb3_mcbs")
@@ -17,36 +18,34 @@ def make_forward_model(
 
     :param environments: the real environments.
     :param kind: "mujoco" for :class:`MujocoBatchModel`, "pool" for :class:`EnvPoolModel`, "auto"
-        for the first where it can simulate the environments exactly, otherwise the second.
-    :param n_threads: simulation threads of the batch model; 0 takes one per processor that this
+        for the first if it can simulate the environments exactly, otherwise the second.
+    :param n_threads: simulation threads of the batch model; 0 uses one per processor that this
         process may use.
     :return: the model; its ``description`` says which it is, and why it is the pool.
     :raises ForwardModelError: with "mujoco", if it cannot simulate these environments.
-    :raises ValueError: for another kind, ``"ensemble"`` among them.
+    :raises ValueError: for another kind, including ``"ensemble"``.
     """
-    if kind not in BACKENDS:
-        raise ValueError(f"unknown forward model {kind!r}; choose one of {', '.join(map(repr, BACKENDS))}")
-    level, reason = logging.INFO, ""
     if kind == "ensemble":
         raise ValueError(
             "An ensemble is learned by an agent, not made from environments: train one with "
             "forward_model='ensemble', or fit an Ensemble and give it to EnsembleModel."
         )
+    if kind not in BACKENDS:
+        raise ValueError(f"unknown forward model {kind!r}; choose one of {', '.join(map(repr, BACKENDS))}")
+    level, reason = logging.INFO, ""
     if kind != "pool":
         try:
             batch = MujocoBatchModel(environments, n_threads)
+            logger.info("look-ahead: %s", batch.description)
+            return batch
         except ForwardModelError as error:
             if kind == "mujoco":
                 raise
-            # A known environment that has to take the slow way is worth a user's attention.
+            # The pool is much slower, so a user should know that a familiar environment needs it.
             if not isinstance(error, NotRecognizedError) or error.notable:
                 level = logging.WARNING
-            reason = str(error)
-        else:
-            logger.info("look-ahead: %s", batch.description)
-            return batch
+            reason = f", because the batch cannot: {error}"
     pool = EnvPoolModel(environments)
-    if reason:
-        pool.description += f", because the batch cannot: {reason}"
+    pool.description += reason
     logger.log(level, "look-ahead: %s", pool.description)
     return pool

@@ -1,9 +1,8 @@
-"""How whole environment classes compute observation, reward and termination, as array code.
+"""How environment classes compute observation, reward and termination, as array code.
 
-A family is what :class:`~sb3_mcbs.models.mujoco_batch.MujocoBatchModel` needs to know about one
-environment class: which of its attributes matter, which ``MjData`` fields it reads, and one
-function that computes the transitions of many rows. ``docs/forward_models.md`` adds one step by
-step.
+A family is what :class:`~sb3_mcbs.models.mujoco_batch.MujocoBatchModel` needs to know about one environment
+class: the attributes and ``MjData`` fields that it reads, and a function that computes the transitions of
+many rows. ``docs/forward_models.md`` shows step by step how to add one.
 """
 
 from collections.abc import Callable
@@ -24,9 +23,9 @@ Outcome = tuple[np.ndarray, np.ndarray, np.ndarray]
 class Fields(NamedTuple):
     """Which ``MjData`` fields a transition reads.
 
-    :param before: as they stand when the step begins. Fields that are not part of MuJoCo's state
-        (``xpos``) lag behind it, exactly as they do in the environment.
-    :param after: as they stand when the step has ended.
+    :param before: fields at the beginning of the step. Those that are not part of MuJoCo's state (``xpos``)
+        lag behind it, exactly as they do in the environment.
+    :param after: fields at the end of the step.
     """
 
     before: tuple[str, ...]
@@ -34,7 +33,7 @@ class Fields(NamedTuple):
 
 
 class Constants:
-    """What does not change from step to step, under the names that the environment itself uses.
+    """What does not change from step to step, under the names that the environment uses.
 
     :param model: the environment's MuJoCo model.
     :param frame_skip: simulation substeps in an environment step.

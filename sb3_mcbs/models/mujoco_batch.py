@@ -8,16 +8,15 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from sb3_mcbs.models.engines import INTEGRATION, Engine, available_cpus, is_state_field, make_engine
+from sb3_mcbs.models.engines import INTEGRATION, STATE_FIELDS, Engine, make_engine
 from sb3_mcbs.models.environments import Environments
 from sb3_mcbs.models.families import Rows, family_of
 from sb3_mcbs.models.recognition import (
     CHECK_ROLLOUTS,
     CHECK_STEPS,
     KnownEnvironment,
-    Refusal,
+    NotRecognizedError,
     Sample,
-    fields_of,
     read_root,
     recognize,
     sample_transitions,
@@ -27,36 +26,28 @@ from sb3_mcbs.types import ForwardModel, ForwardModelError, Transition
 
 _FIRST_CAPACITY = 32
 
-# Engines that a forked process got from its parent. Letting go of one waits for threads that are not there.
+# Engines inherited from the parent of a forked process. Freeing one would wait for threads that do not exist.
 _OF_THE_PARENT: list[Engine] = []
 
 
-class NotRecognizedError(ForwardModelError):
-    """The batch model refuses an environment.
-
-    :ivar notable: whether a user would have expected it to be taken.
-    """
-
-    def __init__(self, message: str, notable: bool = True) -> None:
-        super().__init__(message)
-        self.notable = notable
+def _available_cpus() -> int:
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 class MujocoBatchModel(ForwardModel):
     """Simulates environments of one registered family, bit for bit.
 
-    The main process simulates, wherever the environments live: a root is a small array. All
-    environments must be of one class, with the same arguments and the same model. The model is
-    copied; after an edit of it in the environments call :meth:`refresh`.
+    The main process simulates, even if the environments live in workers: a root is a small array. All
+    environments must be of one class, with the same arguments and the same model. The model is copied; call
+    :meth:`refresh` after editing it in the environments.
 
     :param environments: the real environments.
-    :param n_threads: simulation threads; 0 takes one per processor that this process may use. The
-        numbers do not depend on it.
+    :param n_threads: simulation threads; 0 uses one per processor that this process may use. The results do
+        not depend on it.
     :raises ForwardModelError: if the environments are not of a known family, or if the model and a
         copy of an environment disagree on random transitions.
-
-    :ivar kind: "mujoco".
-    :ivar description: one line that says what simulates.
     """
 
     deterministic = True
@@ -66,7 +57,7 @@ class MujocoBatchModel(ForwardModel):
         if n_threads < 0:
             raise ValueError(f"n_threads must be 0 (all processors) or more, got {n_threads}")
         self._environments = environments
-        self._n_threads = n_threads or available_cpus()
+        self._n_threads = n_threads or _available_cpus()
         self._engine: Engine | None = None
         self._rows = 0
         self.refresh()
@@ -83,20 +74,20 @@ class MujocoBatchModel(ForwardModel):
         except (ForwardModelError, WorkerError):
             raise
         except Exception as error:
-            # An array function that does not fit: whoever asked for "auto" still has the pool.
+            # The family's code does not fit. With "auto" the pool takes over.
             name = known.env_class.__name__
             raise NotRecognizedError(
                 f"the family of {name} failed with {type(error).__name__}: {error}"
             ) from error
 
     def _prepare(self, known: KnownEnvironment) -> None:
-        """Take over what the environments are now, without rows."""
+        """Take over the environments' present model and constants, without rows."""
         family = family_of(known.env_class)
         assert family is not None
         self._family = family
         self._constants = known.constants
-        self._fields = fields_of(known)
-        self._lagging = tuple(name for name in self._fields.before if not is_state_field(name))
+        self._fields = family.fields(known.constants)
+        self._lagging = tuple(name for name in self._fields.before if name not in STATE_FIELDS)
         self._state_size = mujoco.mj_stateSize(known.constants.model, INTEGRATION)
         self._build(_FIRST_CAPACITY)
         self._any_marked = False
@@ -108,17 +99,17 @@ class MujocoBatchModel(ForwardModel):
     def _recognize_all(self) -> KnownEnvironment:
         found = self._environments.apply(range(len(self._environments)), recognize)
         for number, result in enumerate(found):
-            if isinstance(result, Refusal):
-                raise NotRecognizedError(f"environment {number}: {result.reason}", result.notable)
+            if isinstance(result, NotRecognizedError):
+                raise NotRecognizedError(f"environment {number}: {result}", result.notable)
         first: KnownEnvironment = found[0]
         for number, other in enumerate(found[1:], start=1):
-            difference = _difference(first, other)
+            difference = first.difference(other)
             if difference:
                 raise NotRecognizedError(f"environments 0 and {number} differ in their {difference}")
         return first
 
     def _build(self, capacity: int) -> None:
-        """Make an engine for at least ``capacity`` rows, with empty rows."""
+        """Make an engine with room for ``capacity`` rows, all empty."""
         names = tuple(dict.fromkeys(("ctrl", *self._fields.before, *self._fields.after)))
         self.close()
         try:
@@ -138,12 +129,12 @@ class MujocoBatchModel(ForwardModel):
         self._views: dict[int, tuple[Rows, Rows, np.ndarray]] = {}
 
     def _memory(self) -> list[np.ndarray]:
-        """Everything that a row is, as ``[capacity, ...]`` arrays, without its marks."""
+        """The complete state of the rows as ``[capacity, ...]`` arrays, without their marks."""
         assert self._engine is not None
         return [self._engine.state, *(self._before[name] for name in self._lagging)]
 
     def _fill(self, values: Sequence[np.ndarray], rows: int) -> None:
-        """Set the first rows' memory, on a larger engine if this one is too small."""
+        """Set the state of the first rows, in a larger engine if this one is too small."""
         if rows > self._capacity:
             self._build(max(rows, 2 * self._capacity))
         for memory, value in zip(self._memory(), values, strict=True):
@@ -214,12 +205,12 @@ class MujocoBatchModel(ForwardModel):
         rewards: np.ndarray,
         terminated: np.ndarray,
     ) -> np.ndarray:
-        """Remember which rows are of no use any more, and which have ended.
+        """Remember which rows are invalid and which have terminated.
 
         :return: ``[rows]`` bool, which rows are valid.
         """
         rows = len(rewards)
-        # A sum is finite only if all its terms are; if it is not, each is looked at.
+        # A sum is finite only if all its terms are; only otherwise is each of them checked.
         if not math.isfinite(observations.sum() + rewards.sum()):
             broken = ~(np.isfinite(observations).reshape(rows, -1).all(axis=1) & np.isfinite(rewards))
             diverged = broken if diverged is None else diverged | broken
@@ -227,7 +218,7 @@ class MujocoBatchModel(ForwardModel):
             return np.ones(rows, dtype=bool)
         self._any_marked = True
         if diverged is not None:
-            # What a simulation does after its end is nobody's concern, so it cannot make it invalid.
+            # A row cannot become invalid after it has terminated.
             self._diverged[:rows] |= diverged & ~self._ended[:rows]
         self._ended[:rows] |= terminated
         return ~self._diverged[:rows]
@@ -240,8 +231,8 @@ class MujocoBatchModel(ForwardModel):
         arguments = (self._state_size, self._lagging)
         sample: Sample = self._environments.apply([0], sample_transitions, *arguments)[0]
         rng = np.random.default_rng(0)
-        # All transitions as one batch, then the rollouts as they went on: the second also checks
-        # what a row carries from step to step.
+        # All transitions as one batch, then whole rollouts, which also check what a row carries from step
+        # to step.
         flat = Sample(*(array.reshape(-1, 1, *array.shape[2:]) for array in sample))
         for part in (flat, sample):
             self.set_roots(list(part.roots[:, 0]), np.arange(len(part.roots)), rng)
@@ -270,17 +261,3 @@ class MujocoBatchModel(ForwardModel):
             self._engine.close()
         else:
             _OF_THE_PARENT.append(self._engine)
-
-
-def _difference(first: KnownEnvironment, other: KnownEnvironment) -> str:
-    """What distinguishes two environments, or nothing."""
-    if first.env_class is not other.env_class:
-        return f"class ({first.env_class.__name__}, {other.env_class.__name__})"
-    if first.constants.frame_skip != other.constants.frame_skip:
-        return f"frame_skip ({first.constants.frame_skip}, {other.constants.frame_skip})"
-    for name, value in first.constants.attributes.items():
-        if not np.array_equal(value, other.constants.attributes[name]):
-            return f"{name} ({value}, {other.constants.attributes[name]})"
-    if first.packed_model != other.packed_model:
-        return "MuJoCo models"
-    return ""

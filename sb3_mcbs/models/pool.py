@@ -10,7 +10,7 @@ from weakref import finalize
 
 import numpy as np
 
-from sb3_mcbs.models.copies import drop_copies, keep_root, open_copies, select_rows, set_rows, step_rows
+from sb3_mcbs.models.copies import Copies, call_copies, drop_copies
 from sb3_mcbs.models.environments import Environments
 from sb3_mcbs.models.workers import WorkerError
 from sb3_mcbs.types import ForwardModel, ForwardModelError, Transition, stack
@@ -19,7 +19,7 @@ logger = logging.getLogger("sb3_mcbs")
 
 
 class _Root:
-    """Stands for a state that is kept next to its environment, as long as this object lives."""
+    """A state in the process of its environment, kept there as long as this object lives."""
 
     def __init__(self, env_index: int, number: int, dropped: list[int]) -> None:
         self.env_index = env_index
@@ -30,18 +30,16 @@ class _Root:
 class EnvPoolModel(ForwardModel):
     """Simulates with copies of the real environments, wrappers and all.
 
-    Copies live where their environment lives: with a ``SubprocVecEnv`` the workers simulate, at the
-    same time. A row that terminated or became invalid is not stepped further: it keeps its last
-    observation and ``terminated``, and its reward is 0. So does one whose episode the environment itself
-    truncated (``stopped``), but not at a ``TimeLimit``. The copies go when the pool is closed or
+    Copies live in the process of their environment: with a ``SubprocVecEnv`` the workers simulate in
+    parallel. A row that terminated or became invalid is not stepped further: it keeps its last observation
+    and ``terminated``, and its reward is 0. The same holds for a row whose episode the environment itself
+    truncated (``stopped``), but not for a ``TimeLimit``. The copies are closed when the pool is closed or
     collected; those of workers then stay until the next look-ahead.
 
     :param environments: the real environments.
     :raises SnapshotUnsupportedError: if one of them cannot be copied exactly.
 
-    :ivar deterministic: found out by stepping copies; may be set to False by whoever knows better.
-    :ivar kind: "pool".
-    :ivar description: one line that says what simulates.
+    :ivar deterministic: found out by stepping copies. Set it to False if that missed random dynamics.
     """
 
     kind = "pool"
@@ -49,9 +47,9 @@ class EnvPoolModel(ForwardModel):
     def __init__(self, environments: Environments) -> None:
         self._environments = environments
         self._name = uuid.uuid4().hex
-        #: Which environments have rows, and how many.
+        #: The number of rows of each environment that has rows.
         self._counts: dict[int, int] = {}
-        #: Numbers of states that are kept next to the environments and that nobody needs, by environment.
+        #: For each environment, numbers of kept states that are not needed any longer.
         self._dropped: list[list[int]] = [[] for _ in range(len(environments))]
         environments.when_gone(self, drop_copies, self._name)
         self.refresh()
@@ -63,14 +61,12 @@ class EnvPoolModel(ForwardModel):
     def read_roots(self, env_indices: Sequence[int]) -> list[Any]:
         if self._is_unknown:  # the environments have been reset by now
             self.refresh()
-        dropped = [self._dropped[int(i)] for i in env_indices]
-        args = [(self._name, [*numbers]) for numbers in dropped]
-        for numbers in dropped:
-            numbers.clear()
-        kept = self._environments.apply_each(env_indices, keep_root, args)
-        return [
-            _Root(int(i), number, self._dropped[int(i)]) for i, number in zip(env_indices, kept, strict=True)
-        ]
+        args: dict[int, tuple[Any, ...]] = {}
+        for env_index in map(int, env_indices):
+            args[env_index] = ([*self._dropped[env_index]],)
+            self._dropped[env_index].clear()
+        kept = self._each(Copies.keep_root, args)
+        return [_Root(i, number, self._dropped[i]) for i, number in zip(args, kept, strict=True)]
 
     def set_roots(self, roots: Sequence[Any], index: np.ndarray, rng: np.random.Generator) -> None:
         per_root = np.bincount(index, minlength=len(roots)).tolist()
@@ -79,10 +75,10 @@ class EnvPoolModel(ForwardModel):
             if env_index in args:
                 raise ValueError(f"the roots of environment {env_index} must follow each other")
             numbers = list(group)
-            # Rows whose dynamics are not random need no randomness of the caller's.
+            # Deterministic dynamics do not advance the caller's generator.
             seed = 0 if self.deterministic else int(rng.integers(2**63))
             args[env_index] = ([roots[i].number for i in numbers], [per_root[i] for i in numbers], seed)
-        self._each(set_rows, args)
+        self._each(Copies.set_rows, args)
         self._counts = {env_index: sum(counts) for env_index, (_, counts, _) in args.items()}
 
     def select(self, index: np.ndarray) -> None:
@@ -92,7 +88,7 @@ class EnvPoolModel(ForwardModel):
             low, high = np.searchsorted(index, (start, start + count))
             args[env_index] = (index[low:high] - start,)
             start += count
-        self._each(select_rows, args)
+        self._each(Copies.select, args)
         self._counts = {env_index: len(arg[0]) for env_index, arg in args.items()}
 
     def step(self, actions: np.ndarray) -> Transition:
@@ -100,24 +96,28 @@ class EnvPoolModel(ForwardModel):
             raise ValueError(f"expected one action for each of {self.n_rows} rows, got {len(actions)}")
         parts = np.split(actions, np.cumsum(list(self._counts.values()))[:-1])
         args = {i: (part,) for i, part in zip(self._counts, parts, strict=True) if len(part)}
-        results = self._each(step_rows, args)
-        errors = [result[5] for result in results if result[5]]
-        if errors and not self.first_error:
-            self.first_error = errors[0]
+        results = self._each(Copies.step, args)
+        error = next((trace for _, trace in results if trace), "")
+        if error and not self.first_error:
+            self.first_error = error
             logger.warning(
                 "a copy of the environment raised in a look-ahead, which makes that row invalid: %s",
-                self.first_error.strip().splitlines()[-1],
+                error.strip().splitlines()[-1],
             )
-        observations = stack([observation for result in results for observation in result[0]])
-        rewards, terminated, valid, stopped = (
-            np.concatenate([result[k] for result in results]) for k in (1, 2, 3, 4)
+        observations, rewards, *marks = zip(*(row for rows, _ in results for row in rows), strict=True)
+        terminated, valid, stopped = (np.array(mark, dtype=bool) for mark in marks)
+        return Transition(
+            stack(list(observations)),
+            np.array(rewards),
+            terminated,
+            valid,
+            stopped if stopped.any() else None,
         )
-        return Transition(observations, rewards, terminated, valid, stopped if stopped.any() else None)
 
     def refresh(self) -> None:
-        # New copies carry what the environments' simulators are now.
+        # New copies are made from the environments' present simulators.
         self.close()
-        found = self._environments.apply(range(len(self._environments)), open_copies, self._name)
+        found = self._each(Copies.open, dict.fromkeys(range(len(self._environments)), ()))
         self._is_unknown = any(randomness is None for randomness in found)
         self.deterministic = not any(randomness is not None and randomness.any for randomness in found)
         if self._is_unknown:
@@ -132,7 +132,8 @@ class EnvPoolModel(ForwardModel):
             self._environments.apply(range(len(self._environments)), drop_copies, self._name)
         self._counts = {}
 
-    def _each(self, function: Callable[..., Any], args: dict[int, tuple[Any, ...]]) -> list[Any]:
+    def _each(self, method: Callable[..., Any], args: dict[int, tuple[Any, ...]]) -> list[Any]:
+        """Call a method of :class:`Copies` for some environments, with the arguments of each."""
         return self._environments.apply_each(
-            list(args), function, [(self._name, *arg) for arg in args.values()]
+            list(args), call_copies, [(self._name, method, *arg) for arg in args.values()]
         )

@@ -1,4 +1,4 @@
-"""Random numbers in a look-ahead: whether the steps of an environment draw any."""
+"""Finds out whether the steps of an environment draw random numbers."""
 
 import logging
 import sys
@@ -17,14 +17,74 @@ _STARTS, _STEPS = 3, 12
 
 
 class Randomness(NamedTuple):
-    """What random numbers the steps of an environment use.
+    """Which random numbers the steps of an environment use.
 
-    :param any: whether there are any.
-    :param shared: whether the process's global generators are among them.
+    :param any: whether they use any.
+    :param shared: whether they draw from the process's global generators.
     """
 
     any: bool
     shared: bool
+
+
+def probe_randomness(wrapper: SnapshotEnvWrapper) -> Randomness | None:
+    """Step a copy of the environment, to see whether generators move and whether steps can be repeated.
+
+    A probe is no proof: an environment that draws random numbers only in rare states can pass.
+
+    :param wrapper: the environment, left as it is.
+    :return: ``None`` if the environment cannot be reset yet, for example without ``options``.
+    :raises SnapshotUnsupportedError: if steps cannot be repeated although nothing was drawn: then part of the
+        state is not captured.
+    """
+    if not wrapper.verify():
+        return None
+    copied = wrapper.clone()
+    differs = own = shared = False
+    try:
+        present = copied.snapshot()
+        for start in range(_STARTS):
+            try:
+                copied.reset(seed=start, options=wrapper.reset_arguments["options"])
+            except Exception:
+                if wrapper.last_observation is None:
+                    return None
+                copied.restore(present)  # some allow no reset in the middle of an episode
+            runs = []
+            snapshot = copied.snapshot()
+            for seed in (1, 2):
+                with isolated_globals(seed):
+                    copied.restore(snapshot, rng=np.random.default_rng(seed))
+                    own_before, shared_before = _own_generators(copied), _shared_generators()
+                    runs.append(_run(copied, start))
+                    shared = shared or _shared_generators() != shared_before
+                    own = own or _own_generators(copied) != own_before
+            differs = differs or runs[0] != runs[1]
+        drawn = own or shared
+        if differs and not drawn and not _draws_elsewhere(copied):
+            _refuse(wrapper)
+    finally:
+        copied.close()
+    return Randomness(drawn or differs, shared)
+
+
+def _run(env: SnapshotEnvWrapper, seed: int) -> list[Any]:
+    """The outcome of random actions, which depend on the seed alone."""
+    rng = np.random.default_rng(seed)
+    seen: list[Any] = []
+    for _ in range(_STEPS):
+        try:
+            observation, reward, terminated, truncated, _ = env.step(random_action(env.action_space, rng))
+        except Exception as error:
+            return [*seen, f"{type(error).__name__}: {error}"]
+        values = [
+            repr(value.tolist()) if value.dtype.hasobject else value.tobytes()
+            for value in values_of(observation)
+        ]
+        seen.append((values, repr(reward), bool(terminated)))
+        if terminated or truncated:
+            break
+    return seen
 
 
 def _comparable(state: Any) -> str:
@@ -34,12 +94,7 @@ def _comparable(state: Any) -> str:
 
 def _shared_generators() -> list[str]:
     python_state, numpy_state, torch_state = global_states()
-    torch_numbers = None if torch_state is None else torch_state.tolist()
-    return [_comparable(state) for state in (python_state, numpy_state, torch_numbers)]
-
-
-def _content(value: np.ndarray) -> Any:
-    return repr(value.tolist()) if value.dtype.hasobject else value.tobytes()
+    return [_comparable(state) for state in (python_state, numpy_state, torch_state.tolist())]
 
 
 def _own_generators(env: SnapshotEnvWrapper) -> list[str]:
@@ -51,80 +106,6 @@ def _draws_elsewhere(env: SnapshotEnvWrapper) -> bool:
     """Whether an adapter has a generator of its own, which only the adapter can see."""
     adapters = [find_adapter(obj) for obj in env.simulators]
     return any(type(adapter).reseed is not SnapshotAdapter.reseed for adapter in adapters if adapter)
-
-
-class _Probe:
-    """Steps a copy of an environment with two seeds for all that draws.
-
-    :param env: the copy.
-    """
-
-    def __init__(self, env: SnapshotEnvWrapper) -> None:
-        self._env = env
-        self.differs = self.own = self.shared = False
-
-    def look(self, seed: int) -> None:
-        """Look from the copy's present state on.
-
-        :param seed: of the actions.
-        """
-        env, runs = self._env, []
-        snapshot = env.snapshot()
-        for draws in (1, 2):
-            with isolated_globals(draws):
-                env.restore(snapshot, rng=np.random.default_rng(draws))
-                own, common = _own_generators(env), _shared_generators()
-                runs.append(self._run(seed))
-                self.shared = self.shared or _shared_generators() != common
-                self.own = self.own or _own_generators(env) != own
-        self.differs = self.differs or runs[0] != runs[1]
-
-    def _run(self, seed: int) -> list[Any]:
-        """What random actions give; the actions depend on the seed alone."""
-        rng = np.random.default_rng(seed)
-        seen: list[Any] = []
-        for _ in range(_STEPS):
-            try:
-                result = self._env.step(random_action(self._env.action_space, rng))
-            except Exception as error:
-                return [*seen, f"{type(error).__name__}: {error}"]
-            observation, reward, terminated, truncated, _ = result
-            values = [_content(value) for value in values_of(observation)]
-            seen.append((values, repr(reward), bool(terminated)))
-            if terminated or truncated:
-                break
-        return seen
-
-
-def probe_randomness(wrapper: SnapshotEnvWrapper) -> Randomness | None:
-    """Step a copy of the environment: do steps leave all generators alone, and can they be repeated?
-
-    A probe is no proof: an environment that draws random numbers only in rare states can pass.
-
-    :param wrapper: the environment, left as it is.
-    :return: what was found; ``None`` if the environment cannot be reset yet, as without ``options``.
-    :raises SnapshotUnsupportedError: if steps cannot be repeated although nothing was drawn: then part of the
-        state is not captured.
-    """
-    if not wrapper.verify():
-        return None
-    copied = wrapper.clone()
-    try:
-        probe, present = _Probe(copied), copied.snapshot()
-        for start in range(_STARTS):
-            try:
-                copied.reset(seed=start, options=wrapper.reset_arguments["options"])
-            except Exception:
-                if wrapper.last_observation is None:
-                    return None
-                copied.restore(present)  # some allow no reset in the middle of an episode
-            probe.look(start)
-        drawn = probe.own or probe.shared
-        if probe.differs and not drawn and not _draws_elsewhere(copied):
-            _refuse(wrapper)
-    finally:
-        copied.close()
-    return Randomness(drawn or probe.differs, probe.shared)
 
 
 def _refuse(wrapper: SnapshotEnvWrapper) -> None:

@@ -1,6 +1,6 @@
-"""Whether an environment is one whose family is known, and what it does on sample transitions.
+"""Recognises environments of known families, and records sample transitions of them.
 
-These functions run where the environment lives, and only ever step a copy of it.
+These functions run in the process where the environment lives, and only ever step a copy of it.
 """
 
 import pickle
@@ -12,15 +12,16 @@ import mujoco
 import numpy as np
 
 from sb3_mcbs.models.engines import INTEGRATION
-from sb3_mcbs.models.families import Constants, Fields, family_of, known_families
+from sb3_mcbs.models.families import Constants, family_of, known_families
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 from sb3_mcbs.snapshot.layers import replaced_method
+from sb3_mcbs.snapshot.object_graph import class_name
 from sb3_mcbs.snapshot.spaces import random_action
 from sb3_mcbs.snapshot.stand_ins import StandIn
 from sb3_mcbs.types import ForwardModelError
 
-#: Wrappers that change neither observation nor reward nor action, by their full names: RL Zoo
-#: exchanges Gymnasium's TimeLimit for its own when it is imported, before or after ours.
+#: Wrappers that change neither observations nor rewards nor actions. They are named, because RL Zoo
+#: replaces Gymnasium's TimeLimit when it is imported, before or after this package.
 _TRANSPARENT = {
     "gymnasium.wrappers.common.TimeLimit",
     "gymnasium.wrappers.common.OrderEnforcing",
@@ -33,32 +34,43 @@ _TRANSPARENT = {
     "stable_baselines3.common.monitor.Monitor",
 }
 
-#: Rollouts of the check, steps in each, and random steps taken before each (its number times this).
+#: Rollouts of the check, and steps of each; rollout i starts after i * CHECK_SPACING random steps.
 CHECK_ROLLOUTS, CHECK_STEPS, CHECK_SPACING = 4, 8, 9
 
 
-class Refusal(NamedTuple):
-    """Why the batch model cannot simulate an environment.
+class NotRecognizedError(ForwardModelError):
+    """The batch model refuses an environment.
 
-    :param reason: in words.
-    :param notable: whether a user would have expected it to.
+    :ivar notable: whether a user would have expected that it can be simulated.
     """
 
-    reason: str
-    notable: bool
+    def __init__(self, message: str, notable: bool = True) -> None:
+        super().__init__(message)
+        self.notable = notable
 
 
 class KnownEnvironment(NamedTuple):
     """What the batch model must know about one environment of a known family.
 
     :param env_class: its class.
-    :param constants: its model and attributes, as they are now.
+    :param constants: its present model and attributes.
     :param packed_model: the model as bytes, to be compared.
     """
 
     env_class: type
     constants: Constants
     packed_model: bytes
+
+    def difference(self, other: "KnownEnvironment") -> str:
+        """What distinguishes another environment from this one; empty if nothing does."""
+        if self.env_class is not other.env_class:
+            return f"class ({self.env_class.__name__}, {other.env_class.__name__})"
+        if self.constants.frame_skip != other.constants.frame_skip:
+            return f"frame_skip ({self.constants.frame_skip}, {other.constants.frame_skip})"
+        for name, value in self.constants.attributes.items():
+            if not np.array_equal(value, other.constants.attributes[name]):
+                return f"{name} ({value}, {other.constants.attributes[name]})"
+        return "MuJoCo models" if self.packed_model != other.packed_model else ""
 
 
 class Sample(NamedTuple):
@@ -78,56 +90,57 @@ class Sample(NamedTuple):
     terminated: np.ndarray
 
 
-def full_name(kind: type) -> str:
-    """A class's name with its module."""
-    return f"{kind.__module__}.{kind.__qualname__}"
-
-
-def recognize(wrapper: SnapshotEnvWrapper) -> KnownEnvironment | Refusal:
+def recognize(wrapper: SnapshotEnvWrapper) -> KnownEnvironment | NotRecognizedError:
     """Look at an environment and its wrappers.
 
     :param wrapper: the environment.
-    :return: what the batch model needs, or why it cannot simulate this environment.
+    :return: what the batch model needs, or the error that says why it cannot simulate this environment.
     :raises SnapshotUnsupportedError: if its snapshots are not exact.
     """
+    env: Any = wrapper.unwrapped
+    reason = _reason_against(wrapper)
+    if reason:
+        return NotRecognizedError(reason, notable=isinstance(env, known_families()))
+    wrapper.verify()
+    family = family_of(type(env))
+    assert family is not None
+    attributes = {name: getattr(env, name) for name in family.attributes}
+    return KnownEnvironment(
+        type(env), Constants(env.model, env.frame_skip, attributes), pickle.dumps(env.model)
+    )
+
+
+def _reason_against(wrapper: SnapshotEnvWrapper) -> str:
+    """Why the batch model cannot simulate an environment; empty if it can."""
     layer: gym.Env = wrapper
-    base_class = type(wrapper.unwrapped)
-    notable = issubclass(base_class, known_families())
     while True:
         replaced = replaced_method(layer)
         if replaced is not None:
-            return Refusal(f"{type(layer).__name__}.{replaced} was replaced on the instance", notable)
+            return f"{type(layer).__name__}.{replaced} was replaced on the instance"
         if not isinstance(layer, gym.Wrapper):
             break
         kind = type(layer).stands_for if isinstance(layer, StandIn) else type(layer)
-        if kind is not SnapshotEnvWrapper and full_name(kind) not in _TRANSPARENT:
-            reason = f"the wrapper {kind.__name__} may change observations, rewards or actions"
-            return Refusal(reason, notable)
+        if kind is not SnapshotEnvWrapper and class_name(kind) not in _TRANSPARENT:
+            return f"the wrapper {kind.__name__} may change observations, rewards or actions"
         layer = layer.env
-    family = family_of(type(layer))
+    env_class = type(layer)
+    family = family_of(env_class)
     if family is None:
-        parents = [kind.__name__ for kind in base_class.__mro__[1:] if kind in known_families()]
+        parents = [kind.__name__ for kind in env_class.__mro__[1:] if kind in known_families()]
         of = f"only its parent {parents[0]} is" if parents else "see register_family"
-        return Refusal(f"{full_name(base_class)} is not a known family ({of})", notable)
+        return f"{class_name(env_class)} is not a known family ({of})"
     missing = [name for name in family.attributes if not hasattr(layer, name)]
-    if missing:
-        return Refusal(
-            f"{full_name(base_class)} has no {', '.join(missing)}, which its family reads", notable
-        )
-    wrapper.verify()
-    attributes = {name: getattr(layer, name) for name in family.attributes}
-    constants = Constants(layer.model, layer.frame_skip, attributes)  # type: ignore[attr-defined]
-    return KnownEnvironment(type(layer), constants, pickle.dumps(layer.model))  # type: ignore[attr-defined]
+    return f"{class_name(env_class)} has no {', '.join(missing)}, which its family reads" if missing else ""
 
 
 def read_root(wrapper: SnapshotEnvWrapper, state_size: int, lagging: Sequence[str]) -> np.ndarray:
-    """The present state of an environment, as the batch model starts from it.
+    """Read the present state of an environment, as a root of the batch model.
 
     :param wrapper: the environment.
     :param state_size: size of its integration state.
-    :param lagging: derived fields whose values before the next step count too.
+    :param lagging: derived fields whose values before the next step are needed too.
     :return: ``[state_size + sizes of lagging]``.
-    :raises ForwardModelError: if the environment's state has another size by now.
+    :raises ForwardModelError: if the size of the environment's state has changed.
     """
     env: Any = wrapper.unwrapped
     data = env.data
@@ -141,27 +154,20 @@ def read_root(wrapper: SnapshotEnvWrapper, state_size: int, lagging: Sequence[st
     return np.concatenate([state, *(getattr(data, name).ravel() for name in lagging)])
 
 
-def fields_of(known: KnownEnvironment) -> Fields:
-    """The fields that the family of an environment reads."""
-    family = family_of(known.env_class)
-    assert family is not None
-    return family.fields(known.constants)
-
-
 def sample_transitions(wrapper: SnapshotEnvWrapper, state_size: int, lagging: Sequence[str]) -> Sample:
     """Step a copy of the environment with random actions.
 
     :param wrapper: the environment, left as it is.
     :param state_size: size of its integration state.
     :param lagging: derived fields that belong to a root.
-    :return: what the copy did.
+    :return: the transitions of the copy.
     """
     rng = np.random.default_rng(0)
     copied = wrapper.clone()
-    records: list[list[Any]] = [[], [], [], [], []]
+    steps: list[tuple[Any, ...]] = []
     try:
         for rollout in range(CHECK_ROLLOUTS):
-            # The first goes on from where the environment is, if it is anywhere yet.
+            # The first rollout starts from the environment's present state, unless it was never reset.
             if rollout > 0 or wrapper.last_observation is None:
                 copied.reset(seed=int(rng.integers(2**31)))
             for _ in range(rollout * CHECK_SPACING):
@@ -170,10 +176,8 @@ def sample_transitions(wrapper: SnapshotEnvWrapper, state_size: int, lagging: Se
                 action = random_action(copied.action_space, rng)
                 root = read_root(copied, state_size, lagging)
                 observation, reward, terminated, _, _ = copied.step(action)
-                results = (root, action, np.array(observation), np.float64(reward), bool(terminated))
-                for record, result in zip(records, results, strict=True):
-                    record.append(result)
+                steps.append((root, action, np.array(observation), np.float64(reward), bool(terminated)))
     finally:
         copied.close()
-    arrays = [np.stack(record) for record in records]
+    arrays = [np.stack(values) for values in zip(*steps, strict=True)]
     return Sample(*(array.reshape(CHECK_ROLLOUTS, CHECK_STEPS, *array.shape[1:]) for array in arrays))

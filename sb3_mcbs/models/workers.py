@@ -1,4 +1,4 @@
-"""Worker processes of a ``SubprocVecEnv`` that ended without being asked to."""
+"""Detects and reports worker processes of a ``SubprocVecEnv`` that ended unexpectedly."""
 
 import contextlib
 import faulthandler
@@ -15,20 +15,20 @@ from weakref import WeakKeyDictionary
 
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
-#: Seconds that a worker whose pipe broke may take to end, and that the others have to close.
+#: Seconds to wait for a worker whose pipe broke to end, and for the others to close.
 _PATIENCE = 2.0
 
-# Where the workers of a vectorized environment leave their last words, one file each.
+# Folders in which the workers of a vectorized environment write their tracebacks, one file each.
 _REPORTS: WeakKeyDictionary[SubprocVecEnv, tempfile.TemporaryDirectory] = WeakKeyDictionary()
 
 
 class WorkerError(RuntimeError):
     """A worker process has ended. The others were stopped and the vectorized environment is closed.
 
-    :param message: what happened.
-    :param env_index: the environment whose worker ended first, as far as that can be told.
+    :param message: the error message.
+    :param env_index: the environment whose worker ended first, as far as that is known.
     :param exit_code: of that worker; ``-n`` if signal ``n`` killed it.
-    :param worker_traceback: what the worker left of its traceback, may be empty.
+    :param worker_traceback: the worker's traceback, may be empty.
     """
 
     def __init__(self, message: str, env_index: int, exit_code: int, worker_traceback: str) -> None:
@@ -42,7 +42,7 @@ class WorkerError(RuntimeError):
 
 
 def collect_tracebacks(vec_env: SubprocVecEnv) -> None:
-    """Have the workers leave a traceback behind where :func:`worker_error` finds it.
+    """Have workers that end write their traceback to a file that :func:`worker_error` reads.
 
     :param vec_env: environments that are wrapped in ``SnapshotEnvWrapper``.
     """
@@ -54,12 +54,13 @@ def collect_tracebacks(vec_env: SubprocVecEnv) -> None:
 
 
 def await_answers(vec_env: SubprocVecEnv, env_indices: Sequence[int]) -> None:
-    """Wait until workers have answered, if a worker's end would not be noticed otherwise.
+    """Wait until forked workers have answered or one has ended.
 
-    Forked workers hold each other's pipes open: whoever reads from one that has ended waits for ever.
+    Forked workers hold each other's pipes open, so reading the pipe of one that has ended would block for
+    ever. Other workers need no waiting.
 
-    :param vec_env: environments whose workers were asked something.
-    :param env_indices: which.
+    :param vec_env: environments whose workers were sent a command.
+    :param env_indices: the indices of these environments.
     :raises EOFError: if a worker has ended.
     """
     if type(vec_env.processes[0]).__name__ != "ForkProcess":
@@ -78,7 +79,7 @@ def worker_error(vec_env: SubprocVecEnv) -> WorkerError | None:
     """Find out which worker ended, stop the others and close the vectorized environment.
 
     :param vec_env: environments of which one did not answer.
-    :return: what happened, to be raised; None if all workers are alive, or were closed on purpose.
+    :return: the error to raise; None if all workers are alive, or were closed on purpose.
     """
     if vec_env.closed:
         return None
@@ -91,7 +92,7 @@ def worker_error(vec_env: SubprocVecEnv) -> WorkerError | None:
     if not ended:
         return None
     left = {index: _read_traceback(vec_env, index) for index in ended}
-    # One that was killed, or failed, matters more than one that ended because its pipe was closed.
+    # A worker that failed or was killed is the cause; others may have ended because their pipe was closed.
     first = max(ended, key=lambda index: (bool(left[index]), processes[index].exitcode != 0))
     exit_code, text = processes[first].exitcode, left[first]
     _shut_down(vec_env)
@@ -108,7 +109,7 @@ def _report(folder: tempfile.TemporaryDirectory, index: int) -> Path:
 
 
 def _leave_traceback(wrapper: Any, path: str) -> None:
-    """Runs in a worker: prepare to write down what ends it."""
+    """Prepare this worker process to write the traceback of what ends it."""
     report = open(path, "w", encoding="utf-8")  # noqa: SIM115 - stays open for as long as the worker lives
     if not faulthandler.is_enabled():
         faulthandler.enable(report)
@@ -149,7 +150,7 @@ def _hint(exit_code: int) -> str:
 
 
 def _shut_down(vec_env: SubprocVecEnv) -> None:
-    """Do what ``close`` does, which would wait for ever for the worker that has ended."""
+    """Close the vectorized environment; its own ``close`` would wait for ever for the ended worker."""
     for remote in vec_env.remotes:
         with contextlib.suppress(OSError):
             remote.send(("close", None))

@@ -1,8 +1,13 @@
-"""The networks of any trained SB3 off-policy agent as two functions on arrays."""
+"""The networks of a trained SB3 off-policy agent as functions of arrays.
+
+A function uses the networks that the agent has when the function is made: make it anew for every search or
+batch.
+"""
 
 import functools
 from collections.abc import Callable
-from typing import Any, TypeVar
+from contextlib import suppress
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -17,8 +22,6 @@ from sb3_mcbs.networks.mlp import MLP
 from sb3_mcbs.networks.plain_networks import actor_mlp, critic_mlps
 from sb3_mcbs.types import Observations
 
-_T = TypeVar("_T")
-
 SUPPORTED = (TD3, DDPG, SAC, TQC)
 
 
@@ -26,7 +29,7 @@ def check_agent(agent: OffPolicyAlgorithm) -> None:
     """Refuse an agent whose actor and critics a search cannot use.
 
     :param agent: the agent.
-    :raises TypeError: if it is no TD3, DDPG, SAC or TQC (or a subclass).
+    :raises TypeError: if it is not TD3, DDPG, SAC or TQC (or a subclass).
     :raises ValueError: if its actions are not a bounded Box.
     """
     if not isinstance(agent, SUPPORTED):
@@ -36,14 +39,6 @@ def check_agent(agent: OffPolicyAlgorithm) -> None:
         )
     if not isinstance(agent.action_space, spaces.Box):
         raise ValueError(f"A search needs a continuous (Box) action space, got {agent.action_space}.")
-
-
-def _if_plain(make: Callable[[Any], _T], network: Any) -> _T | None:
-    """``make(network)``, or None for a network that it refuses."""
-    try:
-        return make(network)
-    except TypeError:
-        return None
 
 
 def _columns(first: np.ndarray, second: np.ndarray | None, device: th.device) -> th.Tensor:
@@ -67,17 +62,16 @@ def _to_numpy(tensor: th.Tensor, device: th.device) -> np.ndarray:
 def policy_function(agent: OffPolicyAlgorithm, target: bool = False) -> Callable[[Observations], np.ndarray]:
     """The actor without exploration: its output (TD3, DDPG) or its squashed mean (SAC, TQC).
 
-    :param agent: a supported agent. Its networks are those of now: make this function for every search.
-    :param target: for training instead of acting: the target actor where there is one.
+    :param agent: a supported agent.
+    :param target: for training instead of acting: the target actor, if there is one.
     :return: observations ``[rows, *obs_shape]`` -> float32 actions ``[rows, act_dim]`` in [-1, 1].
     """
     own: Any = agent
     stochastic = isinstance(agent, SAC | TQC)
     # SB3 trains what the agent holds, and acts with what its policy holds.
     actor = own.policy.actor if not target else own.actor if stochastic else own.actor_target
-    mlp = _if_plain(actor_mlp, actor)
-    if mlp is not None:
-        return functools.partial(_actions, mlp)
+    with suppress(TypeError):
+        return _plain_policy(actor_mlp(actor))
     device = agent.device if target else agent.policy.device
     if not target:
         agent.policy.set_training_mode(False)
@@ -90,35 +84,32 @@ def policy_function(agent: OffPolicyAlgorithm, target: bool = False) -> Callable
     return policy
 
 
-def _actions(mlp: MLP, observations: np.ndarray) -> np.ndarray:
-    with th.no_grad():
-        return _to_numpy(mlp(_columns(observations, None, mlp.device)), mlp.device).T
+def _plain_policy(mlp: MLP) -> Callable[[Any], np.ndarray]:
+    device = mlp.device
+
+    def policy(observations: np.ndarray) -> np.ndarray:
+        with th.no_grad():
+            return _to_numpy(mlp(_columns(observations, None, device)), device).T
+
+    return policy
 
 
 def value_function(agent: OffPolicyAlgorithm) -> Callable[[Observations, np.ndarray], np.ndarray]:
     """The online critics' estimate: the minimum over critics, or TQC's mean over quantiles.
 
-    :param agent: a supported agent. Its networks are those of now: make this function for every search.
+    :param agent: a supported agent.
     :return: observations ``[rows, *obs_shape]``, scaled actions ``[rows, act_dim]`` -> ``[rows]``.
     """
     policy: Any = agent.policy
     critic = policy.critic
     quantiles = isinstance(agent, TQC)
-
-    mlps = _if_plain(critic_mlps, critic)
-    if mlps is None:
-        policy.set_training_mode(False)
-    device = policy.device if mlps is None else mlps[0].device
+    with suppress(TypeError):
+        return _plain_value(critic_mlps(critic), quantiles)
+    policy.set_training_mode(False)
+    device = policy.device
 
     def value(observations: Observations, actions: np.ndarray) -> np.ndarray:
         with th.no_grad():
-            if mlps is not None:
-                assert isinstance(observations, np.ndarray)
-                inputs = _columns(observations, actions, device)
-                columns = [mlp(inputs) for mlp in mlps]
-                if quantiles:
-                    return _to_numpy(th.cat(columns).mean(dim=0), device)
-                return _to_numpy(functools.reduce(th.minimum, columns)[0], device)
             tensor = obs_as_tensor(observations, device)
             estimates = critic(tensor, th.as_tensor(actions, device=device))
             if quantiles:
@@ -128,26 +119,43 @@ def value_function(agent: OffPolicyAlgorithm) -> Callable[[Observations, np.ndar
     return value
 
 
+def _plain_value(mlps: list[MLP], quantiles: bool) -> Callable[[Any, np.ndarray], np.ndarray]:
+    device = mlps[0].device
+
+    def value(observations: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        with th.no_grad():
+            inputs = _columns(observations, actions, device)
+            outputs = [mlp(inputs) for mlp in mlps]
+            if quantiles:
+                return _to_numpy(th.cat(outputs).mean(dim=0), device)
+            return _to_numpy(functools.reduce(th.minimum, outputs)[0], device)
+
+    return value
+
+
 def soft_policy_function(
     agent: OffPolicyAlgorithm,
 ) -> Callable[[Observations, np.random.Generator], tuple[np.ndarray, np.ndarray]]:
-    """The stochastic actor that is trained, drawn from with a generator of one's own, and its entropy.
+    """Sample the stochastic actor that is trained, and compute its entropy bonus.
 
-    :param agent: a SAC or TQC agent. Its actor is that of now: make this function for every batch.
-    :return: observations ``[rows, *obs_shape]``, generator -> float32 actions ``[rows, act_dim]`` in [-1, 1],
-        and what each adds to the value, ``-ent_coef * log pi(a|s)``, ``[rows]``.
+    :param agent: a SAC or TQC agent.
+    :return: observations ``[rows, *obs_shape]``, generator of the noise -> float32 actions
+        ``[rows, act_dim]`` in [-1, 1], and their entropy bonus ``-ent_coef * log pi(a|s)``, ``[rows]``.
     """
     own: Any = agent
     actor, device = own.actor, agent.device
 
     def draw(observations: Observations, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         with th.no_grad():
-            distribution = _distribution(actor, obs_as_tensor(observations, device))
+            mean, log_std, more = actor.get_action_dist_params(obs_as_tensor(observations, device))
+            distribution = actor.action_dist.proba_distribution(mean, log_std, **more)
             normal = distribution.distribution
             noise = rng.standard_normal(tuple(normal.mean.shape), dtype=np.float32)
             latent = normal.mean + normal.stddev * th.as_tensor(noise, device=device)
             actions = th.tanh(latent)
-            log_prob = _log_prob(actor, distribution, actions, latent)
+            # SB3's gSDE takes no latent action and inverts the squashing itself.
+            arguments = (actions,) if actor.use_sde else (actions, latent)
+            log_prob = distribution.log_prob(*arguments)
             # SB3 has one of the two: the first where the coefficient is learned.
             learned = own.log_ent_coef
             coefficient = own.ent_coef_tensor if learned is None else learned.detach().exp()
@@ -157,9 +165,9 @@ def soft_policy_function(
 
 
 def unscale_function(agent: OffPolicyAlgorithm) -> Callable[[np.ndarray], np.ndarray]:
-    """What turns scaled actions into actions of the environment.
+    """The function that turns scaled actions into actions of the environment.
 
-    :param agent: a supported agent. Its policy is that of now: make this function for every search.
+    :param agent: a supported agent.
     :return: ``[rows, act_dim]`` in [-1, 1] -> ``[rows, *act_shape]``.
     """
     policy: Any = agent.policy
@@ -177,13 +185,3 @@ def unscale_function(agent: OffPolicyAlgorithm) -> Callable[[np.ndarray], np.nda
         return unscaled
 
     return unscale
-
-
-def _distribution(actor: Any, observations: Any) -> Any:
-    mean, log_std, more = actor.get_action_dist_params(observations)
-    return actor.action_dist.proba_distribution(mean, log_std, **more)
-
-
-def _log_prob(actor: Any, distribution: Any, squashed: th.Tensor, latent: th.Tensor) -> th.Tensor:
-    """``log pi(a|s)``; SB3's gSDE takes no latent action and inverts the squashing itself."""
-    return distribution.log_prob(squashed) if actor.use_sde else distribution.log_prob(squashed, latent)

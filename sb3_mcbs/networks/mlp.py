@@ -1,7 +1,7 @@
-"""Multi-layer perceptrons without the calls of modules, and of autograd, around them.
+"""Multi-layer perceptrons computed without torch's module calls and autograd.
 
-For the small networks of continuous control those calls cost as much as the matrix products. Everything
-here is stored ``[features, rows]``: products in this order are quicker for few rows.
+For the small networks of continuous control these cost as much as the matrix products. All arrays are stored
+``[features, rows]``: products in this order are faster for few rows.
 """
 
 from typing import Any
@@ -11,10 +11,10 @@ from torch import nn
 
 
 def own_state(module: nn.Module) -> dict[str, Any]:
-    """A module's attributes, if calling it does what its class says and nothing else.
+    """A module's attributes, if calling the module does nothing but run its class's ``forward``.
 
     :param module: the module.
-    :raises TypeError: if there are hooks, or something else is called in place of the class's method.
+    :raises TypeError: if it has hooks, was compiled, or has a replaced method.
     """
     state = vars(module)
     if (
@@ -33,10 +33,10 @@ def own_state(module: nn.Module) -> dict[str, Any]:
 
 
 class _Linear:
-    """A linear layer's parameters as they are now.
+    """The present parameters of a linear layer.
 
     :param layer: the layer.
-    :raises TypeError: if it is more than a weight and a bias in float32.
+    :raises TypeError: if it has more than a weight and a bias in float32.
 
     :ivar weight: ``[out_features, in_features]``.
     :ivar bias: ``[out_features]`` or None.
@@ -66,7 +66,7 @@ class _Linear:
         """Set the parameters' ``grad``.
 
         :param layer_input: ``[in_features, rows]``.
-        :param gradient: of the loss, by the layer's output: ``[out_features, rows]``.
+        :param gradient: of the loss with respect to the layer's output, ``[out_features, rows]``.
         """
         th.mm(gradient, layer_input.t(), out=_gradient_of(self.weight))
         if self.bias is not None:
@@ -87,11 +87,10 @@ def _gradient_of(parameter: nn.Parameter) -> th.Tensor:
 class MLP:
     """Linear layers with ReLU and Tanh between them, to be called without autograd.
 
-    It knows the layers and parameters that there are when it is made, and does not follow when others take
-    their places.
+    It keeps the layers and parameters that the modules have when it is made.
 
     :param modules: ``nn.Sequential``s and single layers.
-    :raises TypeError: if a layer is of another kind, or more than calling it would do was asked of it.
+    :raises TypeError: if a layer is of another kind, or calling it would do more than compute its output.
     """
 
     def __init__(self, *modules: nn.Module) -> None:
@@ -108,8 +107,8 @@ class MLP:
         is_activation = type(module) in (nn.ReLU, nn.Tanh) and self._layers
         if type(module) is not nn.Sequential and not is_activation:
             raise TypeError(
-                f"{type(module).__name__} is not covered; an MLP begins with Linear and goes on with Linear, "
-                "ReLU and Tanh"
+                f"{type(module).__name__} is not covered; an MLP begins with Linear and continues with "
+                "Linear, ReLU and Tanh"
             )
         state = own_state(module)
         if state["_parameters"] or (is_activation and state["_modules"]):
@@ -121,7 +120,7 @@ class MLP:
 
     @property
     def device(self) -> th.device:
-        """Where the first layer is."""
+        """The device of the first layer."""
         first = self._layers[0]
         assert isinstance(first, _Linear)
         return first.weight.device
@@ -165,14 +164,14 @@ class MLP:
     def backward(
         self, x: th.Tensor, outputs: list[th.Tensor], gradient: th.Tensor, of_parameters: bool
     ) -> th.Tensor:
-        """Propagate a gradient back.
+        """Backpropagate a gradient, either to the parameters or to the input.
 
-        :param x: what :meth:`outputs` was called with.
-        :param outputs: what it returned.
-        :param gradient: of the loss, by the output: ``[out_features, rows]``.
-        :param of_parameters: True sets the parameters' ``grad`` (does not add to it), and spares the
-            gradient by the input; False is the other way round.
-        :return: the gradient by the input, ``[in_features, rows]``, if ``of_parameters`` is False.
+        :param x: the input of :meth:`outputs`.
+        :param outputs: the result of :meth:`outputs`.
+        :param gradient: of the loss with respect to the output, ``[out_features, rows]``.
+        :param of_parameters: True sets the parameters' ``grad`` (does not add to it) and skips the gradient
+            with respect to the input; False does the opposite.
+        :return: with ``of_parameters=False`` the gradient with respect to the input, ``[in_features, rows]``.
         """
         for index in range(len(self._layers) - 1, -1, -1):
             layer = self._layers[index]

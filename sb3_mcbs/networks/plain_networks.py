@@ -1,7 +1,7 @@
-"""SB3's networks as MLPs, where they are as SB3 makes them. Whatever else was done to them, SB3 runs.
+"""SB3's networks as MLPs, as long as they are as SB3 makes them. SB3 itself runs those that were changed.
 
-A network may be changed at any time: layers replaced or frozen, hooks put on it, another one in its place. So
-nothing of what is found out here is kept: whoever searches or trains asks anew.
+A user may change a network at any time: replace or freeze layers, add hooks, or exchange the network. So the
+results here are not cached: every search and every training asks anew.
 """
 
 from typing import Any
@@ -22,17 +22,16 @@ from torch.optim import optimizer as torch_optimizer
 
 from sb3_mcbs.networks.mlp import MLP, own_state
 
-#: Neither subclasses nor wrappers of these, which may do something else.
+#: Subclasses and wrappers are not included, since they may do something else.
 _NETWORKS: tuple[type[nn.Module], ...] = (TD3Actor, SACActor, TQCActor, ContinuousCritic, TQCCritic)
 _LAYERS = (nn.Linear, nn.ReLU, nn.Tanh, nn.Sequential, nn.Flatten, FlattenExtractor)
 
 
-def _methods(cls: type) -> frozenset[str]:
-    return frozenset(name for name in dir(cls) if callable(getattr(cls, name)))
-
-
-_METHODS = {cls: _methods(cls) for cls in (*_NETWORKS, th.optim.Adam)}
-#: What calling a network calls. Somebody may put something else in its place.
+_METHODS = {
+    cls: frozenset(name for name in dir(cls) if callable(getattr(cls, name)))
+    for cls in (*_NETWORKS, th.optim.Adam)
+}
+#: What calling a network calls; a user may replace it.
 _CALLED = [
     (cls, name, getattr(cls, name))
     for cls, name in (
@@ -49,9 +48,9 @@ _TANH = nn.Tanh()
 
 
 def check_unreplaced(called: list[tuple[Any, str, Any]]) -> None:
-    """Refuse to do by other means what somebody has put something else in the place of.
+    """Refuse to bypass functions that a user has replaced.
 
-    :param called: classes or modules, names in them, and what the names stood for at first.
+    :param called: classes or modules, names in them, and the original functions of these names.
     :raises TypeError: names the first that was replaced.
     """
     for owner, name, function in called:
@@ -60,7 +59,7 @@ def check_unreplaced(called: list[tuple[Any, str, Any]]) -> None:
 
 
 def _check_everywhere() -> None:
-    """Refuse what is done to every call of every network."""
+    """Refuse hooks and settings that affect all networks."""
     if (
         torch_module._global_forward_hooks
         or torch_module._global_forward_pre_hooks
@@ -76,7 +75,7 @@ def _check_everywhere() -> None:
 def _check_plain(network: Any) -> Any:
     """Refuse an actor or critic that does more than flatten observations and call its layers.
 
-    :return: its modules by their names.
+    :return: its modules by name.
     """
     _check_everywhere()
     if type(network) not in _NETWORKS:
@@ -121,10 +120,10 @@ def actor_mlp(actor: Any) -> MLP:
 
 
 def critic_mlps(critic: Any) -> list[MLP]:
-    """The single networks of a critic.
+    """The networks of a critic.
 
     :param critic: an SB3 critic.
-    :return: each: float32 observations above actions ``[obs_dim + act_dim, rows]`` -> ``[1, rows]`` or
+    :return: for each: float32 observations above actions ``[obs_dim + act_dim, rows]`` -> ``[1, rows]`` or
         quantiles ``[n_quantiles, rows]``.
     :raises TypeError: if the critic is more than MLPs.
     """
@@ -134,13 +133,13 @@ def critic_mlps(critic: Any) -> list[MLP]:
     return [MLP(network) for network in critic.q_networks]
 
 
-def parameters_of(network: Any, mlps: list[MLP]) -> list[nn.Parameter]:
-    """The parameters of a TD3 actor, or of a critic.
+def parameters_of(network: Any, mlps: list[MLP]) -> list[th.Tensor]:
+    """The parameters of a TD3 actor or of a critic.
 
     :param network: the actor or critic.
-    :param mlps: what it calculates.
-    :return: as its ``parameters()``.
-    :raises TypeError: if it has others than those that it calculates with.
+    :param mlps: its MLPs.
+    :return: in the order of ``network.parameters()``.
+    :raises TypeError: if the network has parameters that its MLPs do not use.
     """
     state = vars(network)
     _, *called = state["_modules"].values()  # the first extracts features
@@ -150,8 +149,8 @@ def parameters_of(network: Any, mlps: list[MLP]) -> list[nn.Parameter]:
     return [parameter for mlp in mlps for parameter in mlp.parameters]
 
 
-def check_trained(network: Any, parameters: list[nn.Parameter]) -> None:
-    """Refuse to train a network of which something else is asked than Adam's steps along gradients.
+def check_trained(network: Any, parameters: list[th.Tensor]) -> None:
+    """Refuse to train a network that needs more than plain Adam steps on its gradients.
 
     :param network: the actor or critic, with its optimizer.
     :param parameters: its parameters.

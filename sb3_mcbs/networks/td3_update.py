@@ -1,15 +1,14 @@
 """TD3's gradient step with SB3's mathematics and fewer instructions.
 
-What SB3 does and this does not: convert float64 observations at every call of a network, compute
-gradients that are thrown away (of the critics' weights in the actor's step), build autograd's graph,
-and step Adam and the target networks one tensor at a time. Random numbers are drawn in the same order,
-so both give the same networks up to float32 rounding.
+Unlike SB3 it does not convert float64 observations at every call of a network, compute gradients that are not
+needed (of the critics' weights in the actor's step), build autograd's graph, or update Adam and the target
+networks one tensor at a time. Random numbers are drawn in the same order, so both give the same networks up
+to float32 rounding.
 """
 
 import logging
-from collections.abc import Collection, Iterator
-from contextlib import contextmanager
-from typing import Any, ClassVar
+from collections.abc import Collection
+from typing import ClassVar
 
 import numpy as np
 import torch as th
@@ -19,7 +18,6 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.td3 import td3 as td3_module
 from torch.nn import functional as F
 
-from sb3_mcbs.networks.mlp import MLP
 from sb3_mcbs.networks.plain_networks import (
     actor_mlp,
     check_trained,
@@ -36,22 +34,21 @@ _SB3S_TRAIN = TD3.train
 class TD3Update:
     """The gradient steps of a TD3 agent whose networks are plain MLPs.
 
-    It knows the networks, optimizers and parameters that there are when it is made.
+    It keeps the networks, optimizers and parameters that the agent has when it is made.
 
     :param agent: the agent; its networks, optimizers, replay buffer and settings are used, and changed, as
         by its own ``train``.
-    :raises TypeError: if something about a network or optimizer is not covered. SB3's own ``train`` is for
-        those.
+    :raises TypeError: if something about a network or optimizer is not covered; use SB3's ``train`` then.
     """
-
-    _targets_and_networks: list[tuple[list[th.Tensor], list[th.Tensor]]]
 
     def __init__(self, agent: TD3) -> None:
         self._agent = agent
-        self._actor, actor = _actor_and_parameters(agent.actor)
-        self._actor_target, actor_target = _actor_and_parameters(agent.actor_target)
-        self._critics, critic = _critics_and_parameters(agent.critic)
-        self._critic_targets, critic_target = _critics_and_parameters(agent.critic_target)
+        self._actor, self._actor_target = actor_mlp(agent.actor), actor_mlp(agent.actor_target)
+        self._critics, self._critic_targets = critic_mlps(agent.critic), critic_mlps(agent.critic_target)
+        actor = parameters_of(agent.actor, [self._actor])
+        actor_target = parameters_of(agent.actor_target, [self._actor_target])
+        critic = parameters_of(agent.critic, self._critics)
+        critic_target = parameters_of(agent.critic_target, self._critic_targets)
         check_trained(agent.actor, actor)
         check_trained(agent.critic, critic)
         if len({*map(id, actor), *map(id, critic)}) != len(actor) + len(critic):
@@ -69,7 +66,7 @@ class TD3Update:
         :param batch_size: transitions sampled for each.
         """
         agent = self._agent
-        # No layer here does anything else in training mode, so the mode stays as it is.
+        # The training mode makes no difference to these layers, so it is not set.
         agent._update_learning_rate([agent.actor.optimizer, agent.critic.optimizer])
         actor_losses, critic_losses = [], []
         with th.no_grad():
@@ -136,17 +133,17 @@ class TD3Update:
         return float(-values.mean())
 
     def _action_gradient(self, pairs: th.Tensor, n_obs: int) -> tuple[th.Tensor, th.Tensor]:
-        """How the actor's loss changes with its actions.
+        """The gradient of the actor's loss with respect to its actions.
 
         :param pairs: ``[obs_dim + act_dim, batch]``, with the actor's actions.
         :param n_obs: obs_dim.
         :return: the first critic's values ``[1, batch]``, and the gradient ``[act_dim, batch]``.
         """
-        first_critic = self._critics[0]
-        outputs = first_critic.outputs(pairs)
+        critic = self._critics[0]
+        outputs = critic.outputs(pairs)
         values = outputs[-1]
         gradient = th.full_like(values, -1 / values.numel())
-        return values, first_critic.backward(pairs, outputs, gradient, of_parameters=False)[n_obs:]
+        return values, critic.backward(pairs, outputs, gradient, of_parameters=False)[n_obs:]
 
     def _update_target_networks(self) -> None:
         for targets, networks in self._targets_and_networks:
@@ -154,7 +151,7 @@ class TD3Update:
             th._foreach_add_(targets, networks, alpha=self._agent.tau)
 
 
-#: What TD3's ``train`` calls besides networks and optimizers. Somebody may put something else in its place.
+#: What TD3's ``train`` calls besides networks and optimizers; a user may replace it.
 _CALLED = [
     (owner, name, getattr(owner, name)) for owner, name in ((F, "mse_loss"), (td3_module, "polyak_update"))
 ]
@@ -168,25 +165,25 @@ class FastUpdate(TD3):
     """
 
     #: What neither ``save`` nor an exact checkpoint contains, and why.
-    not_checkpointed: ClassVar[Collection[str]] = {"_reasons_said": "what the user of this process was told"}
-    #: Whether to; ``False`` leaves gradient steps to SB3.
+    not_checkpointed: ClassVar[Collection[str]] = {"_reasons_said": "messages to the user of this process"}
+    #: ``False`` leaves gradient steps to SB3.
     fast_update: bool
-    #: Why they were left to SB3 although it is True, as far as the user was told.
+    #: The messages that said why gradient steps were left to SB3.
     _reasons_said: frozenset[str] = frozenset()
 
     def _setup_model(self) -> None:
         super()._setup_model()
         self._reasons_said = frozenset()
-        self._present_update()  # whoever cannot have it is told at once
+        self._present_update()  # tells the user at once if the fast steps cannot be used
 
     def _make_update(self) -> TD3Update:
         check_unreplaced(_CALLED)
         if getattr(super().train, "__func__", None) is not _SB3S_TRAIN:
-            raise TypeError("a class of the agent's has a train of its own")
+            raise TypeError("a class of the agent overrides train")
         return TD3Update(self)
 
     def _present_update(self) -> TD3Update | None:
-        """The fast gradient steps for the networks and optimizers as they are now, if there are any."""
+        """The fast gradient steps for the present networks and optimizers, or None if they cannot be used."""
         if not isinstance(self.fast_update, bool):
             raise TypeError(f"fast_update must be True or False, got {self.fast_update!r}.")
         if not self.fast_update:
@@ -219,16 +216,6 @@ class FastUpdate(TD3):
         return [*super()._excluded_save_params(), *FastUpdate.not_checkpointed]
 
 
-def _actor_and_parameters(actor: Any) -> tuple[MLP, list[Any]]:
-    mlp = actor_mlp(actor)
-    return mlp, parameters_of(actor, [mlp])
-
-
-def _critics_and_parameters(critic: Any) -> tuple[list[MLP], list[Any]]:
-    mlps = critic_mlps(critic)
-    return mlps, parameters_of(critic, mlps)
-
-
 def _pairs(observations: th.Tensor, actions: th.Tensor) -> th.Tensor:
     """Observations above actions: float32 ``[obs_dim + act_dim, batch]``."""
     observations = observations.flatten(1)
@@ -240,18 +227,14 @@ def _pairs(observations: th.Tensor, actions: th.Tensor) -> th.Tensor:
 
 
 def _adam_step(optimizer: th.optim.Optimizer) -> None:
-    with _fused(optimizer.param_groups[0]):
+    """Step Adam, on the CPU with all tensors in one call unless the user chose otherwise."""
+    group = optimizer.param_groups[0]
+    fuse = group["params"][0].device.type == "cpu" and not group["foreach"] and group["fused"] is None
+    if not fuse:  # on other devices torch groups the tensors itself
         optimizer.step()
-
-
-@contextmanager
-def _fused(group: dict[str, Any]) -> Iterator[None]:
-    """Let Adam do all tensors in one call; its settings, which are saved with the agent, stay."""
-    if group["params"][0].device.type != "cpu" or group["foreach"] or group["fused"] is not None:
-        yield  # elsewhere torch does many tensors at once by itself; a choice of the user's stays
         return
     group["fused"] = True
     try:
-        yield
+        optimizer.step()
     finally:
-        group["fused"] = None
+        group["fused"] = None  # the settings are saved with the agent

@@ -1,4 +1,4 @@
-"""Settings of torch that hold for the whole process, changed for a while and put back."""
+"""Temporary changes of torch settings that hold for the whole process."""
 
 import ctypes
 import functools
@@ -19,10 +19,10 @@ _PROCESS = os.getpid()
 def go_on_in_process(process: int) -> int:
     """Have torch compute on one thread in a process that was forked after torch had started threads.
 
-    They do not survive the fork, and whoever waits for them waits for ever.
+    The threads do not survive the fork, and waiting for them would never end.
 
-    :param process: the id of the process that made what goes on here.
-    :return: the id of this one.
+    :param process: the id of the process in which the caller was made.
+    :return: the id of this process.
     """
     here = os.getpid()
     if process != here and th.get_num_threads() > 1:
@@ -37,11 +37,10 @@ def go_on_in_process(process: int) -> int:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Leave the processor's cores to the simulation.
+    """Have torch compute on one thread, and leave the processor's cores to the simulation.
 
     After work on several threads, torch's idle OpenMP threads spin for milliseconds on the cores that the
-    simulation needs, so they are released (torch starts them again when it wants them). What torch does in
-    between runs on one thread.
+    simulation needs, so they are released; torch starts them again when it needs them.
     """
     n_threads = th.get_num_threads()
     if n_threads == 1:
@@ -58,7 +57,7 @@ def one_thread() -> Iterator[None]:
 
 @functools.cache
 def _openmp_pause() -> Callable[[int], int]:
-    """``omp_pause_resource_all`` of the OpenMP library that torch uses; nothing where there is none."""
+    """``omp_pause_resource_all`` of the OpenMP library that torch uses; does nothing if there is none."""
     try:
         return ctypes.CDLL(th._C.__file__).omp_pause_resource_all
     except (AttributeError, OSError):  # built without OpenMP, or with one older than 5.0
@@ -69,7 +68,7 @@ def _openmp_pause() -> Callable[[int], int]:
 def matmul_precision(precision: str | None) -> Iterator[None]:
     """Compute float32 matrix products with another internal precision.
 
-    :param precision: as in ``torch.set_float32_matmul_precision``; ``None`` changes nothing.
+    :param precision: as for ``torch.set_float32_matmul_precision``; ``None`` changes nothing.
     """
     if precision is None:
         yield

@@ -1,14 +1,13 @@
 """Search over a forward model: proposing candidates, rolling them out, scoring, selecting."""
 
 from sb3_mcbs.search.beam import beam_search
+from sb3_mcbs.search.cem import EpisodeClock, WarmStart
 from sb3_mcbs.search.deadline import LatencyForecast, deadline_search
-from sb3_mcbs.search.directions import RecentActions
 from sb3_mcbs.search.interface import FirstStep, PolicyFunctions, Rollouts, Roots, SearchResult, policy_alone
-from sb3_mcbs.search.proposals import Noise, draw_noise
+from sb3_mcbs.search.proposals import Noise, RecentActions, draw_noise
 from sb3_mcbs.search.settings import PRESETS, SearchSettings, make_settings, with_preset
 from sb3_mcbs.search.strategies import check_dynamics, search
 from sb3_mcbs.search.strategy_settings import BeamSettings, CEMSettings, TreeSettings
-from sb3_mcbs.search.warm_start import EpisodeClock, WarmStart
 
 __all__ = [
     "PRESETS",

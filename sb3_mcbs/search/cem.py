@@ -6,14 +6,24 @@ that the noise of later steps belongs to the plan. With ``noise_hold`` above 1 a
 macro-step, and axes of ``rollout_depth`` count those.
 """
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from sb3_mcbs.search.beam import choose, join_rounds, mean_values, short_horizon
-from sb3_mcbs.search.directions import combine, gain
 from sb3_mcbs.search.interface import PolicyFunctions, Rollouts, Roots, SearchResult
-from sb3_mcbs.search.proposals import Noise, best, critic_values, draw_normal, preselect, propose, scale
+from sb3_mcbs.search.proposals import (
+    Noise,
+    best,
+    combine,
+    critic_values,
+    draw_normal,
+    gain,
+    preselect,
+    propose,
+    scale,
+)
 from sb3_mcbs.search.strategy_settings import CEMSettings
 
 
@@ -153,3 +163,79 @@ def _as_noise(plans: np.ndarray, n_simulations: int) -> Noise:
     by_depth = np.moveaxis(later, 2, 0)[:, :, :, None]
     shape = (*by_depth.shape[:3], n_simulations, by_depth.shape[4])
     return Noise(plans[:, :, 0], np.broadcast_to(by_depth, shape))
+
+
+#: When a decision was made: how often its environment had been reset or restored, and the steps since then.
+EpisodeClock = tuple[int, int]
+
+
+class WarmStart:
+    """The plan that was followed last in every environment.
+
+    A plan is for the steps right after its decision. It is recalled for what is left of it then, and not at
+    all if the environment was reset or restored since.
+
+    :param n_envs: number of environments.
+    :param horizon: environment steps of a plan.
+    :param act_dim: entries of one action.
+    """
+
+    def __init__(self, n_envs: int, horizon: int, act_dim: int) -> None:
+        #: By environment step: a decision's macro-steps need not begin where those of the last one did.
+        self._plans = np.zeros((n_envs, horizon, act_dim), dtype=np.float32)
+        self._episode_clocks: list[EpisodeClock | None] = [None] * n_envs
+
+    def recall(self, envs: Sequence[int], now: Sequence[EpisodeClock], noise_hold: int = 1) -> np.ndarray:
+        """Shift the plans by the steps since their decisions.
+
+        :param envs: the environments that decide.
+        :param now: the present moment of each.
+        :param noise_hold: environment steps in a macro-step.
+        :return: ``[len(envs), rollout_depth, act_dim]``, by macro-steps; 0 where nothing is left.
+        """
+        horizon = self._plans.shape[1]
+        recalled = np.zeros((len(envs), *self._plans.shape[1:]), dtype=self._plans.dtype)
+        for row, (env, age) in enumerate(zip(envs, self._ages(envs, now), strict=True)):
+            if 0 <= age < horizon:
+                recalled[row, : horizon - age] = self._plans[env, age:]
+        return recalled.reshape(len(envs), -1, noise_hold, recalled.shape[2]).mean(axis=2)
+
+    def keep(self, plans: np.ndarray, envs: Sequence[int], now: Sequence[EpisodeClock]) -> None:
+        """Remember the plans of a decision.
+
+        :param plans: ``[len(envs), rollout_depth, act_dim]``, by macro-steps.
+        :param envs: the environments that decided.
+        :param now: the present moment of each.
+        """
+        by_step = np.repeat(plans, self._plans.shape[1] // plans.shape[1], axis=1)
+        for plan, env, moment in zip(by_step, envs, now, strict=True):
+            self._plans[env] = plan
+            self._episode_clocks[env] = moment
+
+    def _ages(self, envs: Sequence[int], now: Sequence[EpisodeClock]) -> list[int]:
+        """Steps since the decisions; -1 where there is no plan for this episode."""
+        thens = [self._episode_clocks[env] for env in envs]
+        return [
+            present[1] - then[1] if then is not None and then[0] == present[0] else -1
+            for then, present in zip(thens, now, strict=True)
+        ]
+
+    def state(self, now: Sequence[EpisodeClock]) -> dict[str, Any]:
+        """What :meth:`set_state` takes, as plain values that do not depend on how often was reset.
+
+        :param now: the present moment of every environment.
+        :return: the plans, and their ages.
+        """
+        return {"plans": self._plans.copy(), "ages": self._ages(range(len(now)), now)}
+
+    def set_state(self, state: dict[str, Any], now: Sequence[EpisodeClock]) -> None:
+        """Remember what another memory did.
+
+        :param state: from :meth:`state`.
+        :param now: the present moment of every environment, which are in the states of then.
+        """
+        self._plans[:] = state["plans"]
+        self._episode_clocks = [
+            (resets, steps - age) if age >= 0 else None
+            for (resets, steps), age in zip(now, state["ages"], strict=True)
+        ]

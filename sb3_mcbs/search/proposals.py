@@ -4,14 +4,18 @@ All random numbers of a decision are drawn before anything is simulated, as floa
 so that they do not depend on what the simulations give.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_mcbs.search.directions import low_dimensional
 from sb3_mcbs.search.interface import PolicyFunctions
 from sb3_mcbs.search.settings import SearchSettings
 from sb3_mcbs.types import Observations, take_rows
+
+#: Actions that are remembered, and how many are needed before directions are learned from them.
+RECENT, ENOUGH = 1000, 100
+#: A direction whose variance is below this share of the largest is none.
+_NEGLIGIBLE = 1e-6
 
 
 class Noise(NamedTuple):
@@ -153,3 +157,82 @@ def clip_actions(actions: np.ndarray) -> np.ndarray:
     :return: the same array.
     """
     return np.maximum(np.minimum(actions, 1, out=actions), -1, out=actions)
+
+
+class RecentActions:
+    """The last actions that an agent executed, in all its environments and episodes.
+
+    :param act_dim: entries of one action.
+    """
+
+    def __init__(self, act_dim: int) -> None:
+        self._actions = np.zeros((RECENT, act_dim), dtype=np.float32)
+        self._count = 0
+
+    def __len__(self) -> int:
+        return min(self._count, RECENT)
+
+    def note(self, actions: np.ndarray) -> None:
+        """Remember actions in place of the oldest ones.
+
+        :param actions: ``[n, act_dim]``, scaled, as executed.
+        """
+        places = (self._count + np.arange(len(actions))) % RECENT
+        self._actions[places[-RECENT:]] = actions[-RECENT:]
+        self._count += len(actions)
+
+    def directions(self, n_directions: int) -> np.ndarray | None:
+        """Find the principal directions: those in which the actions vary most around their mean.
+
+        :param n_directions: how many.
+        :return: ``[n_directions, act_dim]``, orthonormal; ``None`` while fewer than ``ENOUGH`` actions are
+            known, or if they vary in fewer directions than that.
+        """
+        if len(self) < ENOUGH:
+            return None
+        actions = self._actions[: len(self)].astype(np.float64)
+        deviations = actions - actions.mean(axis=0)
+        variances, axes = np.linalg.eigh(deviations.T @ deviations)
+        if variances[-n_directions] <= _NEGLIGIBLE * variances[-1]:
+            return None
+        return axes[:, ::-1][:, :n_directions].T.astype(np.float32)
+
+    def state(self) -> dict[str, Any]:
+        """What :meth:`set_state` takes, as plain values."""
+        return {"actions": self._actions.copy(), "count": self._count}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Remember what another memory did.
+
+        :param state: from :meth:`state`.
+        """
+        self._actions[:] = state["actions"]
+        self._count = int(state["count"])
+
+
+def gain(directions: np.ndarray | None) -> float:
+    """What noise along directions is multiplied by, so that its total variance is that in all directions.
+
+    :param directions: ``[n_directions, act_dim]``, orthonormal; ``None`` is all.
+    """
+    return 1.0 if directions is None else float(np.sqrt(directions.shape[1] / len(directions)))
+
+
+def combine(coordinates: np.ndarray, directions: np.ndarray | None) -> np.ndarray:
+    """Turn coordinates along directions into actions.
+
+    :param coordinates: ``[..., act_dim]``, of which only the first ``n_directions`` count.
+    :param directions: ``[n_directions, act_dim]``; ``None``: coordinates are the entries of actions.
+    :return: ``[..., act_dim]``.
+    """
+    return coordinates if directions is None else coordinates[..., : len(directions)] @ directions
+
+
+def low_dimensional(noise: np.ndarray, directions: np.ndarray | None) -> np.ndarray:
+    """Turn noise in all directions into noise in some, of the same total variance.
+
+    :param noise: ``[..., act_dim]``, independent entries of equal standard deviation.
+    :param directions: ``[n_directions, act_dim]``, orthonormal; ``None`` leaves it as it is.
+    :return: ``[..., act_dim]``.
+    """
+    return noise if directions is None else combine(noise, np.float32(gain(directions)) * directions)

@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_mcbs.search.beam import choose
-from sb3_mcbs.search.directions import low_dimensional
 from sb3_mcbs.search.interface import (
     FirstStep,
     PolicyFunctions,
@@ -24,6 +23,7 @@ from sb3_mcbs.search.proposals import (
     clip_actions,
     critic_values,
     draw_normal,
+    low_dimensional,
     preselect,
     propose,
     scale,
