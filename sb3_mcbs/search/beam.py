@@ -95,7 +95,9 @@ def short_horizon(
         rows = np.flatnonzero(step.goes_on)
         if not len(rows):  # lines 29 and 30
             break
-        rollouts, observations = rollouts[rows], take_rows(step.observations, rows)
+        observations = step.observations
+        if len(rows) < len(actions):
+            rollouts, observations = rollouts[rows], take_rows(observations, rows)
         offsets = held_noise(noise, settings, depth, rollouts, n_sim)  # line 32
         proposed = clip_actions(functions.policy(observations)[:, None] + offsets)  # line 33
         actions, copies = proposed.reshape(-1, act_dim), proposed.shape[1]
@@ -104,8 +106,10 @@ def short_horizon(
         if depth < settings.horizon and (copies > 1 or len(rows) < model.n_rows):
             model.select(rows)  # line 34
     else:
-        closing = take_rows(observations, np.repeat(np.arange(n_rows(observations)), copies))
-        returns[rollouts] += alpha * functions.value(closing, actions).astype(np.float64)[:, None]  # line 36
+        if copies > 1:
+            observations = take_rows(observations, np.repeat(np.arange(n_rows(observations)), copies))
+        values = functions.value(observations, actions).astype(np.float64)  # line 36
+        returns[rollouts] += alpha * values[:, None]  # line 37
     return Rollouts(candidates, returns.reshape(n_envs, beam, n_sim), first_step, simulated_steps)
 
 
