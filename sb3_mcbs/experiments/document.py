@@ -124,9 +124,9 @@ class Document:
         """
         names = sorted(known)
         if not isinstance(value, str) or value not in names:
-            close = difflib.get_close_matches(str(value), names, n=3 if len(names) > 60 else 1)
+            close = difflib.get_close_matches(str(value), names, n=3 if len(names) > 100 else 1)
             hint = f" Did you mean {' or '.join(close)}?" if close else ""
-            listed = f" Known are {', '.join(names)}." if len(names) <= 60 else ""
+            listed = f" Known are {', '.join(names)}." if len(names) <= 100 else ""
             raise self.error(place, f"there is no {what} {value!r}.{hint}{listed}")
         return value
 

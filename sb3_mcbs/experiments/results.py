@@ -3,6 +3,7 @@
 import fcntl
 import json
 import os
+import socket
 from pathlib import Path
 from typing import IO, Any
 
@@ -45,7 +46,7 @@ class Lock:
             file.close()
             return False
         file.truncate(0)
-        file.write(f"{os.getpid()}\n")
+        file.write(f"{os.getpid()} on {socket.gethostname()}\n")
         file.flush()
         self._file = file
         return True
@@ -64,7 +65,7 @@ class Lock:
 
     def holder(self) -> str:
         """
-        :return: the number of the process that took it last
+        :return: the process that took it last
         """
         return self.path.read_text().strip() if self.path.is_file() else ""
 
