@@ -10,9 +10,12 @@ from pathlib import Path
 import pytest
 import yaml
 from rich.console import Console
+from stable_baselines3 import TD3 as TD3Agent
+from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_mcbs.experiments import command, expand, read_spec
 from sb3_mcbs.experiments.display import Display
+from sb3_mcbs.experiments.evaluation import play
 from sb3_mcbs.experiments.local import ATTEMPTS, LocalEngine
 from sb3_mcbs.experiments.results import ResultsError, RunFolder, prepare
 from tests.experiment_helpers import (
@@ -30,6 +33,7 @@ from tests.experiment_helpers import (
     trainers_of,
     wait_for,
 )
+from tests.zoo_helpers import evaluations
 
 NAMES = (TD3, MCBS)
 linux_only = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="looks into /proc")
@@ -76,6 +80,31 @@ def test_what_is_finished_is_left_alone_and_runs_may_be_added(undisturbed: Path,
     after = {path: path.stat().st_mtime_ns for path in (results / "runs").rglob("*.zip")}
     assert len(after) == 3 and before.items() <= after.items()
     assert final(folder_of(results, "ppo_Pendulum-v1_0"))["ppo.timesteps"].tolist() == [200, 400]
+
+
+def test_a_trained_agent_alone_and_with_search(undisturbed: Path, tmp_path: Path) -> None:
+    trained = folder_of(undisturbed / "results", TD3)
+    agent = trained.training(trained.run()) / "Pendulum-v1.zip"
+    search = {"policy": "search", "params": {"beam_width": 2, "rollout_depth": 1, "n_simulations": 1}}
+    spec = {
+        "agents": {"td3": {"file": str(agent), "environment": "Pendulum-v1"}},
+        "seeds": [0],
+        "evaluation": {"episodes": 2},
+        "arms": {"actor": {"policy": "actor"}, "search": search},
+    }
+    (tmp_path / "frozen.yml").write_text(yaml.safe_dump(spec, sort_keys=False))
+    status, text = run(tmp_path / "frozen.yml", tmp_path / "results")
+    assert status == 0 and "2 of 2 episodes, search -" in text, text
+    alone, searched = (
+        evaluations(folder.training(folder.run()))
+        for folder in (folder_of(tmp_path / "results", f"{name}_td3_0") for name in ("actor", "search"))
+    )
+    env = make_vec_env("Pendulum-v1")
+    expected = [play(TD3Agent.load(agent), env, seed, True)[0] for seed in (10_000, 10_001)]
+    assert alone["results"].tolist() == [expected]
+    assert alone["seeds"].tolist() == searched["seeds"].tolist() == [10_000, 10_001]
+    assert (alone["simulated_steps"], searched["simulated_steps"]) == ([0], [2 * 2 * 200])
+    assert (alone["results"] != searched["results"]).all()
 
 
 @pytest.mark.parametrize(
@@ -262,7 +291,7 @@ def test_the_table_of_a_terminal(tmp_path: Path, undisturbed: Path) -> None:
     with runner.display.of(runner.jobs):
         runner.display.refresh()
     text = runner.display.console.export_text()
-    assert "steps/s" in text and "400 / 400" in text and "actor -" in text
+    assert "per s" in text and "400 / 400" in text and "actor -" in text
 
 
 def test_specs_of_other_names_have_folders_of_their_own(tmp_path: Path) -> None:

@@ -83,11 +83,25 @@ def check_params(
             document.choice(where, value, NAMES[name], name)
 
 
+def check_search(document: Document, place: Place, params: dict[str, Any], index: Place = ()) -> None:
+    """
+    :param document: the spec
+    :param place: where the settings stand in it
+    :param params: settings of a search around a trained agent
+    :param index: where the value stands below its name
+    :raises SpecError: if there is no such setting, or its value is of a wrong type
+    """
+    known = _parameters("mcbs_td3").keys() - _parameters("td3").keys()
+    for name, value in params.items():
+        document.choice((*place, name, *index), name, known, "setting of a search:")
+        check_params(document, place, "mcbs_td3", {name: value}, index)
+
+
 def _check_type(document: Document, place: Place, parameter: inspect.Parameter, value: Any) -> None:
     """Check what is annotated as one of a few plain types; RL Zoo reads more for the others."""
     annotation = parameter.annotation
-    words = annotation if isinstance(annotation, str) else getattr(annotation, "__name__", str(annotation))
-    names = [word.strip() for word in str(words).split("|")]
+    words = annotation if isinstance(annotation, str) else inspect.formatannotation(annotation)
+    names = [word.strip() for word in words.split("|")]
     if parameter.name == "policy" or not set(names) <= {*_TYPES, "None"}:
         return
     if value is None and "None" in names:

@@ -74,7 +74,8 @@ def _matching(runs: list[Run], pattern: str | None) -> list[Run]:
 def _describe(run: Run) -> str:
     params = yaml.safe_dump(run.params, default_flow_style=True, width=1000, sort_keys=False).strip()
     changed = f" with {params}" if run.params else ""
-    return f"{run.name}: {run.algorithm}, {run.steps} steps, hyperparameters of {run.source}{changed}"
+    of_what = f"hyperparameters of {run.source}" if run.agent is None else f"around {run.agent.file}"
+    return f"{run.name}: {run.algorithm}, {run.steps} {run.unit}, {of_what}{changed}"
 
 
 if __name__ == "__main__":

@@ -39,8 +39,9 @@ class Display:
         if not self.console.is_terminal:
             yield
             return
-        with Live(console=self.console, auto_refresh=False, transient=True) as self._live:
+        with Live(console=self.console, auto_refresh=False) as self._live:
             yield
+            self.refresh()  # what stays on the screen
         self._live = None
 
     def refresh(self) -> None:
@@ -61,8 +62,8 @@ class Display:
         if self._live is None:
             speed, left = _number(job.steps_per_second), _duration(job.seconds_left)
             self.say(
-                f"{job.folder.name}: {job.step} of {job.run.steps} steps, {_returns(job)}"
-                f"{f', {speed} steps/s' if speed else ''}{f', {left} left' if left else ''}"
+                f"{job.folder.name}: {job.step} of {job.run.steps} {job.run.unit}, {_returns(job)}"
+                f"{f', {speed} {job.run.unit}/s' if speed else ''}{f', {left} left' if left else ''}"
             )
 
     def summary(self, jobs: Sequence[Job]) -> None:
@@ -83,7 +84,7 @@ class Display:
     def _table(self) -> Table:
         table = Table(box=None, pad_edge=False)
         table.add_column("run", no_wrap=True)
-        for name in ("state", "step", "steps/s", "last returns", "left"):
+        for name in ("state", "done", "per s", "last returns", "left"):
             table.add_column(name, justify="left" if name == "state" else "right", no_wrap=True)
         shown = self._shown()
         for job in shown:

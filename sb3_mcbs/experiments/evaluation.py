@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -16,8 +16,43 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize, sync_envs_nor
 from sb3_mcbs.agents import SearchPolicy
 from sb3_mcbs.experiments.results import write
 
+#: What every ``evaluations.npz`` has: the first three as SB3's ``EvalCallback`` writes them.
+ARRAYS = ("timesteps", "results", "ep_lengths", "seeds", "simulated_steps", "seconds")
 #: Seconds between two reports of progress.
 _REPORT_EVERY = 1.0
+
+
+def play(
+    policy: Any, env: VecEnv, seed: int, deterministic: bool, callback: Callable[..., None] | None = None
+) -> tuple[float, int]:
+    """
+    Play one episode.
+
+    :param policy: what acts
+    :param env: a single environment
+    :param seed: that it is reset with
+    :param deterministic: whether actions are
+    :param callback: called after every step
+    :return: the return, and the number of steps
+    """
+    env.seed(seed)
+    returns, lengths = evaluate_policy(
+        policy, env, 1, deterministic, callback=callback, return_episode_rewards=True, warn=False
+    )
+    assert isinstance(returns, list) and isinstance(lengths, list)
+    return float(returns[0]), int(lengths[0])
+
+
+def write_evaluations(folder: Path, arrays: dict[str, Any]) -> None:
+    """
+    :param folder: where ``evaluations.npz`` is to be
+    :param arrays: its content, all of :data:`ARRAYS`
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    partial = folder / ".evaluations.npz"
+    content: dict[str, Any] = {name: np.asarray(arrays[name]) for name in ARRAYS}
+    np.savez(partial, **content)
+    partial.replace(folder / "evaluations.npz")
 
 
 class PolicyEvaluation(BaseCallback):
@@ -77,15 +112,8 @@ class PolicyEvaluation(BaseCallback):
         """
         if isinstance(self.eval_env, VecNormalize):
             sync_envs_normalization(self.training_env, self.eval_env)
-        returns: list[float] = []
-        lengths: list[int] = []
-        for seed in self.seeds:
-            self.eval_env.seed(seed)
-            episode = evaluate_policy(
-                self.model, self.eval_env, 1, self.deterministic, return_episode_rewards=True, warn=False
-            )
-            returns += map(float, episode[0])  # type: ignore[arg-type]
-            lengths += map(int, episode[1])  # type: ignore[arg-type]
+        episodes = [play(self.model, self.eval_env, seed, self.deterministic) for seed in self.seeds]
+        returns, lengths = [each[0] for each in episodes], [each[1] for each in episodes]
         self.timesteps.append(self.num_timesteps)
         self.results.append(returns)
         self.ep_lengths.append(lengths)
@@ -98,12 +126,7 @@ class PolicyEvaluation(BaseCallback):
         )
 
     def _write(self) -> None:
-        self.log_path.mkdir(parents=True, exist_ok=True)
-        names = ("timesteps", "results", "ep_lengths", "seeds", "simulated_steps", "seconds")
-        partial = self.log_path / ".evaluations.npz"
-        arrays: dict[str, Any] = {name: np.asarray(getattr(self, name)) for name in names}
-        np.savez(partial, **arrays)
-        partial.replace(self.log_path / "evaluations.npz")
+        write_evaluations(self.log_path, {name: getattr(self, name) for name in ARRAYS})
 
     def _on_step(self) -> bool:
         return True

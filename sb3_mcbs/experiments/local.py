@@ -110,7 +110,7 @@ class LocalEngine:
             self.display.say(f"{name}: finished")
         elif self._n_signals:
             job.end("interrupted")
-            self.display.say(f"{name}: stopped at {job.step} steps")
+            self.display.say(f"{name}: stopped at {job.step} {job.run.unit}")
         else:
             job.crashes += 1
             again = job.crashes < ATTEMPTS

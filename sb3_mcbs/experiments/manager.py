@@ -26,7 +26,8 @@ class RunManager(MCBSExperimentManager):
     def create_callbacks(self) -> None:
         """Create RL Zoo's callbacks, and those of an experiment."""
         super().create_callbacks()
-        if self.algo in ALGORITHMS:
+        has_own = any(isinstance(callback, ExactCheckpointCallback) for callback in self.callbacks)
+        if self.algo in ALGORITHMS and not has_own:
             path = Path(self.save_path) / CHECKPOINTS
             self.callbacks.insert(0, ExactCheckpointCallback(self.run.checkpoint_every, path))
         self.callbacks.append(

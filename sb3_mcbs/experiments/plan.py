@@ -1,13 +1,13 @@
 """The runs of an experiment, each complete in itself."""
 
 import re
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from sb3_mcbs.experiments.spec import Arm, Evaluation, Spec, SpecError
+from sb3_mcbs.experiments.spec import Agent, Arm, Evaluation, Spec, SpecError
 from sb3_mcbs.zoo.paths import PathError, hyperparams_path
 
 _VERSION = re.compile(r"(.+)-v(\d+)")
@@ -16,19 +16,20 @@ _VERSION = re.compile(r"(.+)-v(\d+)")
 @dataclass(frozen=True)
 class Run:
     """
-    One training, with all that decides about it.
+    One training, or one evaluation of a trained agent, with all that decides about it.
 
     :param name: of the run, and of its folder
     :param arm: the arm that it belongs to
-    :param algorithm: RL Zoo's name of the algorithm
+    :param algorithm: RL Zoo's name of the algorithm; of a trained agent ``actor`` or ``search``
     :param environment: id
-    :param seed: of the training
-    :param steps: environment steps
+    :param seed: of the training, or of the search
+    :param steps: environment steps; of a trained agent, episodes
     :param evaluation: how it is evaluated
     :param checkpoint_every: environment steps between two exact checkpoints
-    :param params: hyperparameters that replace those of the file
+    :param params: hyperparameters that replace those of the file, or settings of the search
     :param source: which entry of which file the hyperparameters are
     :param hyperparameters: that entry
+    :param agent: that is evaluated; None: one is trained
     """
 
     name: str
@@ -40,8 +41,14 @@ class Run:
     evaluation: Evaluation
     checkpoint_every: int
     params: dict[str, Any]
-    source: str
-    hyperparameters: dict[str, Any]
+    source: str = ""
+    hyperparameters: dict[str, Any] = field(default_factory=dict)
+    agent: Agent | None = None
+
+    @property
+    def unit(self) -> str:
+        """What ``steps`` counts."""
+        return "steps" if self.agent is None else "episodes"
 
     def as_yaml(self) -> str:
         """
@@ -56,7 +63,8 @@ def from_yaml(text: str) -> Run:
     :return: the run
     """
     content = yaml.safe_load(text)
-    return Run(**{**content, "evaluation": Evaluation(**content["evaluation"])})
+    agent = content["agent"] and Agent(**content["agent"])
+    return Run(**{**content, "evaluation": Evaluation(**content["evaluation"]), "agent": agent})
 
 
 def expand(spec: Spec) -> list[Run]:
@@ -71,6 +79,12 @@ def expand(spec: Spec) -> list[Run]:
         _run(spec, arm, environment, seed)
         for seed in spec.seeds
         for environment in spec.environments
+        for arm in spec.arms
+    ]
+    runs += [
+        _frozen_run(spec, arm, agent, seed)
+        for seed in spec.seeds
+        for agent in spec.agents
         for arm in spec.arms
     ]
     names = [run.name for run in runs]
@@ -95,6 +109,21 @@ def _run(spec: Spec, arm: Arm, environment: str, seed: int) -> Run:
         params=arm.params,
         source=f"{path.name}: {entry}",
         hyperparameters=hyperparameters,
+    )
+
+
+def _frozen_run(spec: Spec, arm: Arm, agent: Agent, seed: int) -> Run:
+    return Run(
+        name=f"{arm.name}_{agent.name}_{seed}",
+        arm=arm.name,
+        algorithm=arm.algorithm,
+        environment=agent.environment,
+        seed=seed,
+        steps=spec.evaluation.episodes,
+        evaluation=spec.evaluation,
+        checkpoint_every=0,
+        params=arm.params,
+        agent=agent,
     )
 
 

@@ -95,8 +95,9 @@ class RunFolder:
         """
         if not self.definition.is_file():
             self.path.mkdir(parents=True, exist_ok=True)
-            entry = yaml.safe_dump({run.environment: run.hyperparameters}, sort_keys=False)
-            write(self.hyperparameters, entry)
+            if run.agent is None:
+                entry = yaml.safe_dump({run.environment: run.hyperparameters}, sort_keys=False)
+                write(self.hyperparameters, entry)
             write(self.definition, run.as_yaml())
 
     def run(self) -> Run:
@@ -108,7 +109,7 @@ class RunFolder:
     def training(self, run: Run) -> Path:
         """
         :param run: what is trained here
-        :return: RL Zoo's folder of the run
+        :return: RL Zoo's folder of the run; the same for the evaluation of a trained agent
         """
         return self.logs / run.algorithm / f"{run.environment.replace('/', '-')}_1"
 

@@ -1,12 +1,15 @@
 """What an experiment consists of, read from a YAML file and checked."""
 
+import hashlib
 import itertools
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from sb3_mcbs.experiments.algorithms import check_params, known_algorithms, known_environments
+from sb3_mcbs.experiments.algorithms import check_params, check_search, known_algorithms, known_environments
 from sb3_mcbs.experiments.document import Document, Place, SpecError, read_document
 
 SPECS = Path(__file__).parent / "specs"
@@ -14,6 +17,9 @@ SPECS = Path(__file__).parent / "specs"
 _NAME = re.compile(r"[A-Za-z0-9][\w.+=-]*")
 _REQUIRED = ("environments", "seeds", "steps", "evaluation")
 _OPTIONAL = ("description", "algorithms", "arms", "hyperparameters", "checkpoint_every")
+#: Of a spec that trains nothing.
+_REQUIRED_FROZEN = ("agents", "arms", "seeds", "evaluation")
+_POLICIES = ("actor", "search")
 
 
 @dataclass(frozen=True)
@@ -21,7 +27,7 @@ class Evaluation:
     """
     How all runs are evaluated.
 
-    :param every: environment steps between two evaluations
+    :param every: environment steps between two evaluations; 0 where nothing is trained
     :param episodes: of each policy in each evaluation
     :param first_seed: the first episode is reset with this seed, the next with the one after it, and so on:
         in every evaluation of every run
@@ -35,11 +41,12 @@ class Evaluation:
 @dataclass(frozen=True)
 class Arm:
     """
-    A variant of an algorithm.
+    A variant of an algorithm, or of the search around a trained agent.
 
     :param name: its name in tables and folders
-    :param algorithm: RL Zoo's name of the algorithm
-    :param params: hyperparameters that replace those of the file, as RL Zoo's ``-params``
+    :param algorithm: RL Zoo's name of the algorithm; of a trained agent ``actor`` or ``search``
+    :param params: hyperparameters that replace those of the file, as RL Zoo's ``-params``, or settings of
+        ``SearchPolicy``
     """
 
     name: str
@@ -48,19 +55,39 @@ class Arm:
 
 
 @dataclass(frozen=True)
+class Agent:
+    """
+    A trained agent.
+
+    :param name: its name in tables and folders
+    :param environment: id
+    :param file: as ``save`` wrote it
+    :param sha256: of the file
+    :param statistics: of its observations, as ``save_statistics`` wrote them; None: none
+    """
+
+    name: str
+    environment: str
+    file: str
+    sha256: str
+    statistics: str | None = None
+
+
+@dataclass(frozen=True)
 class Spec:
     """
-    An experiment: every arm in every environment with every seed.
+    An experiment: every arm in every environment, or with every trained agent, with every seed.
 
     :param name: of the experiment
     :param text: the file as it was read
     :param environments: ids
-    :param seeds: of the training
+    :param seeds: of the training, or of the search
     :param steps: environment steps of each run
     :param evaluation: how the runs are evaluated
     :param arms: what is compared
     :param hyperparameters: the file of an algorithm, where it is not the usual one
     :param checkpoint_every: environment steps between two exact checkpoints
+    :param agents: trained agents that are evaluated; nothing is trained if there are any
     """
 
     name: str
@@ -72,6 +99,7 @@ class Spec:
     arms: list[Arm]
     hyperparameters: dict[str, Path]
     checkpoint_every: int
+    agents: list[Agent] = field(default_factory=list)
 
 
 def read_spec(name: str | Path) -> Spec:
@@ -82,29 +110,79 @@ def read_spec(name: str | Path) -> Spec:
     :return: what it says
     :raises SpecError: if there is no such file, or something in it is wrong
     """
-    path = Path(name)
+    path = Path(name) if Path(name).suffix else SPECS / f"{name}.yml"
     if not path.is_file():
-        path = SPECS / f"{name}.yml"
-    if not path.is_file() or (path.parent != SPECS and not path.suffix):
         shipped = ", ".join(sorted(spec.stem for spec in SPECS.glob("*.yml")))
         raise SpecError(f"There is no file {name}, and no shipped spec of this name; shipped are {shipped}.")
     document = read_document(path)
+    if isinstance(document.data, dict) and "agents" in document.data:
+        return _frozen_spec(document, path)
     top = document.keys((), document.data, {*_REQUIRED, *_OPTIONAL}, _REQUIRED)
     steps = document.integer(("steps",), top["steps"], 1)
     return Spec(
         name=path.stem,
         text=document.text,
         environments=_environments(document, top["environments"]),
-        seeds=[
-            document.integer(("seeds", index), seed, 0)
-            for index, seed in enumerate(document.sequence(("seeds",), top["seeds"]))
-        ],
+        seeds=_seeds(document, top["seeds"]),
         steps=steps,
         evaluation=_evaluation(document, top["evaluation"], steps),
         arms=_arms(document, top),
         hyperparameters=_hyperparameters(document, top.get("hyperparameters", {}), path.parent),
         checkpoint_every=document.integer(("checkpoint_every",), top.get("checkpoint_every", 10_000), 1),
     )
+
+
+def _frozen_spec(document: Document, path: Path) -> Spec:
+    top = document.keys((), document.data, {"description", *_REQUIRED_FROZEN}, _REQUIRED_FROZEN)
+    evaluation = document.keys(("evaluation",), top["evaluation"], ("episodes", "first_seed"), ("episodes",))
+    arms = [
+        arm
+        for name, value in document.mapping(("arms",), top["arms"]).items()
+        for arm in _arm(document, ("arms", name), name, value, "policy")
+    ]
+    agents = [
+        _agent(document, ("agents", name), name, value, path.parent)
+        for name, value in document.mapping(("agents",), top["agents"]).items()
+    ]
+    return Spec(
+        name=path.stem,
+        text=document.text,
+        environments=[],
+        seeds=_seeds(document, top["seeds"]),
+        steps=0,
+        evaluation=_checked_evaluation(document, {"every": 0, **evaluation}),
+        arms=arms,
+        hyperparameters={},
+        checkpoint_every=0,
+        agents=agents,
+    )
+
+
+def _agent(document: Document, place: Place, name: str, value: Any, folder: Path) -> Agent:
+    _check_name(document, place, name)
+    keys = document.keys(place, value, ("file", "environment", "statistics"), ("file", "environment"))
+    environment = document.choice(
+        (*place, "environment"), keys["environment"], known_environments(), "environment"
+    )
+    file = _find(document, (*place, "file"), keys["file"], folder)
+    statistics = None
+    if "statistics" in keys:
+        statistics = str(_find(document, (*place, "statistics"), keys["statistics"], folder).resolve())
+    digest = hashlib.sha256(file.read_bytes()).hexdigest()
+    return Agent(name, environment, str(file.resolve()), digest, statistics)
+
+
+def _find(document: Document, place: Place, name: Any, folder: Path) -> Path:
+    """A file that the spec names, seen from its own folder or else from the present one."""
+    for path in (folder / str(name), Path(str(name))):
+        if isinstance(name, str) and path.is_file():
+            return path
+    raise document.error(place, f"{name!r} is not a file, seen from {folder.resolve()} or from {Path.cwd()}.")
+
+
+def _seeds(document: Document, value: Any) -> list[int]:
+    seeds = document.sequence(("seeds",), value)
+    return [document.integer(("seeds", index), seed, 0) for index, seed in enumerate(seeds)]
 
 
 def _environments(document: Document, value: Any) -> list[str]:
@@ -118,15 +196,20 @@ def _environments(document: Document, value: Any) -> list[str]:
 def _evaluation(document: Document, value: Any, steps: int) -> Evaluation:
     place: Place = ("evaluation",)
     settings = document.keys(place, value, ("every", "episodes", "first_seed"), ("every", "episodes"))
-    for name, number in settings.items():
-        document.integer((*place, name), number, 0 if name == "first_seed" else 1)
-    evaluation = Evaluation(**settings)
+    document.integer((*place, "every"), settings["every"], 1)
+    evaluation = _checked_evaluation(document, settings)
     if steps % evaluation.every:
         raise document.error(
             (*place, "every"),
             f"{steps} steps are no multiple of {evaluation.every}: the trained agent would not be evaluated.",
         )
     return evaluation
+
+
+def _checked_evaluation(document: Document, settings: dict[str, Any]) -> Evaluation:
+    for name, number in settings.items():
+        document.integer(("evaluation", name), number, 1 if name == "episodes" else 0)
+    return Evaluation(**settings)
 
 
 def _arms(document: Document, top: dict[str, Any]) -> list[Arm]:
@@ -136,7 +219,7 @@ def _arms(document: Document, top: dict[str, Any]) -> list[Arm]:
         for index, algorithm in enumerate(algorithms)
     ]
     for name, value in document.mapping(("arms",), top.get("arms", {})).items():
-        for arm in _arm(document, ("arms", name), name, value):
+        for arm in _arm(document, ("arms", name), name, value, "algorithm"):
             if any(arm.name == other.name for other in arms):
                 raise document.error(("arms", name), f"there are two arms of the name {arm.name}.")
             arms.append(arm)
@@ -145,19 +228,32 @@ def _arms(document: Document, top: dict[str, Any]) -> list[Arm]:
     return arms
 
 
-def _arm(document: Document, place: Place, name: str, value: Any) -> list[Arm]:
+def _check_name(document: Document, place: Place, name: str) -> None:
     if not _NAME.fullmatch(name):
-        raise document.error(place, "is no name for an arm: letters, digits and any of _ . + = - are.")
-    settings = document.keys(place, value, ("algorithm", "params", "grid"), ("algorithm",))
-    algorithm = document.choice((*place, "algorithm"), settings["algorithm"], known_algorithms(), "algorithm")
+        raise document.error(place, "is no name for this: letters, digits and any of _ . + = - are.")
+
+
+def _arm(document: Document, place: Place, name: str, value: Any, kind: str) -> list[Arm]:
+    """
+    :param kind: the key that says what it is a variant of: ``algorithm``, or of a trained agent ``policy``.
+    """
+    _check_name(document, place, name)
+    settings = document.keys(place, value, (kind, "params", "grid"), (kind,))
+    known = known_algorithms() if kind == "algorithm" else _POLICIES
+    algorithm = document.choice((*place, kind), settings[kind], known, kind)
+    check: Callable[..., None] = check_search
+    if kind == "algorithm":
+        check = partial(check_params, algorithm=algorithm)
     params = document.mapping((*place, "params"), settings.get("params", {}))
-    check_params(document, (*place, "params"), algorithm, params)
     grid = document.mapping((*place, "grid"), settings.get("grid", {}))
+    if algorithm == "actor" and (params or grid):
+        raise document.error(place, "the actor alone has no settings: remove its params and grid.")
+    check(document, (*place, "params"), params=params)
     for key, values in grid.items():
         if key in params:
             raise document.error((*place, "grid", key), "is in params as well.")
         for index, item in enumerate(document.sequence((*place, "grid", key), values)):
-            check_params(document, (*place, "grid"), algorithm, {key: item}, (index,))
+            check(document, (*place, "grid"), params={key: item}, index=(index,))
     arms = []
     for combination in itertools.product(*grid.values()):
         chosen = dict(zip(grid, combination, strict=True))
@@ -179,7 +275,5 @@ def _hyperparameters(document: Document, value: Any, folder: Path) -> dict[str, 
     for algorithm, name in document.mapping(("hyperparameters",), value).items():
         place = ("hyperparameters", algorithm)
         document.choice(place, algorithm, known_algorithms(), "algorithm")
-        if not isinstance(name, str) or not (folder / name).is_file():
-            raise document.error(place, f"{name!r} is not a file (seen from {folder.resolve()}).")
-        files[algorithm] = folder / name
+        files[algorithm] = _find(document, place, name, folder)
     return files

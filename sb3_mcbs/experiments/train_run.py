@@ -38,34 +38,43 @@ def _end_with(parent: int | None) -> None:
 
 def train_run(path: Path) -> None:
     """
-    Train a run to its end.
+    Train a run to its end, or evaluate its agent.
 
     :param path: its folder
     """
     # Imported only now: importing takes seconds in which the parent may end.
-    from sb3_mcbs.experiments.manager import RunManager
+    from sb3_mcbs.experiments.frozen import evaluate_agent
     from sb3_mcbs.experiments.results import FINISHED, RunFolder
-    from sb3_mcbs.zoo import train
     from sb3_mcbs.zoo.manager import CHECKPOINTS
-    from sb3_mcbs.zoo.registration import register
-    from sb3_mcbs.zoo.resume import resume
 
     folder = RunFolder(path)
     run = folder.run()
+    if run.agent is None:
+        _train(folder)
+    else:
+        evaluate_agent(folder)
+    # Whoever asks for the state of a run believes this line: it is written when all else is there.
+    folder.status = {**folder.status, "state": FINISHED, "ended": time.time()}
+    shutil.rmtree(folder.training(run) / CHECKPOINTS, ignore_errors=True)
+
+
+def _train(folder: "RunFolder") -> None:
+    from sb3_mcbs.experiments.manager import RunManager
+    from sb3_mcbs.zoo import train
+    from sb3_mcbs.zoo.registration import register
+    from sb3_mcbs.zoo.resume import resume
+
     register()
     import rl_zoo3.train
 
-    RunManager.run, RunManager.folder = run, folder
+    RunManager.run, RunManager.folder = folder.run(), folder
     rl_zoo3.train.ExperimentManager = RunManager  # type: ignore[misc]
-    if folder.has_begun(run):
-        resume(folder.training(run))
+    if folder.has_begun(RunManager.run):
+        resume(folder.training(RunManager.run))
     else:
         shutil.rmtree(folder.logs, ignore_errors=True)
         sys.argv = ["rl_zoo3.train", *_arguments(folder)]
         train.main()
-    # Whoever asks for the state of a run believes this line: it is written when all else is there.
-    folder.status = {**folder.status, "state": FINISHED, "ended": time.time()}
-    shutil.rmtree(folder.training(run) / CHECKPOINTS, ignore_errors=True)
 
 
 def _arguments(folder: "RunFolder") -> list[str]:
