@@ -192,7 +192,7 @@ def write(path: Path, text: str) -> None:
     :param path: a file, replaced in one go
     :param text: its new content
     """
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
+    partial = path.with_name(f".{path.name}.partial")
     partial.write_text(text)
     partial.replace(path)
 

@@ -50,8 +50,8 @@ class MujocoBatchModel(ForwardModel):
     copied; after an edit of it in the environments call :meth:`refresh`.
 
     :param environments: the real environments.
-    :param n_threads: simulation threads; 0 takes one per processor that this process may use. The
-        numbers do not depend on it.
+    :param n_threads: simulation threads; 0 takes one per processor that this process may use,
+        and no more than ``OMP_NUM_THREADS``. The numbers do not depend on it.
     :raises ForwardModelError: if the environments are not of a known family, or if the model and a
         copy of an environment disagree on random transitions.
 
