@@ -4,6 +4,7 @@ import io
 import os
 import signal
 import socket
+import subprocess
 import sys
 from pathlib import Path
 
@@ -178,6 +179,26 @@ def test_killed_runs_and_a_killed_runner_end_as_if_nothing_had_happened(
 
 
 @linux_only
+def test_a_run_ends_with_its_runner_from_its_first_moment_on(tmp_path: Path) -> None:
+    """Also while it imports, when nothing of this package is there yet to see to it."""
+    code = (
+        "import sys, time; from pathlib import Path; from sb3_mcbs.experiments.job import Job;"
+        "from sb3_mcbs.experiments.results import RunFolder; folder = RunFolder(Path(sys.argv[1]));"
+        "folder.lock.take(); Job(folder).start(['sleep', '60']); print('started', flush=True); time.sleep(60)"
+    )
+    spec = read_spec(spec_file(tmp_path))
+    folder = prepare(tmp_path / "results", spec, expand(spec))[0]
+    parent = subprocess.Popen(
+        [sys.executable, "-c", code, str(folder.path)], stdout=subprocess.PIPE, text=True
+    )
+    read_until(parent, "started")
+    assert not folder.lock.take()
+    parent.kill()
+    parent.communicate()
+    wait_for(folder.lock.take, 2)
+
+
+@linux_only
 @pytest.mark.parametrize("signum", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_a_signal_stops_all_runs_after_a_checkpoint(
     signum: signal.Signals, undisturbed: Path, tmp_path: Path
@@ -197,18 +218,31 @@ def test_a_signal_stops_all_runs_after_a_checkpoint(
 
 
 @linux_only
+@pytest.mark.slow
+def test_an_algorithm_without_checkpoints_begins_again(tmp_path: Path) -> None:
+    ppo = {"ppo": {"algorithm": "ppo", "params": {"n_steps": 64, "n_envs": 2}}}
+    spec = spec_file(tmp_path, arms=ppo, steps=2000)
+    assert run(spec, tmp_path / "calm")[0] == 0
+    killed, calm = (folder_of(tmp_path / name, "ppo_Pendulum-v1_0") for name in ("killed", "calm"))
+    runner = begin(spec, tmp_path / "killed")
+    wait_for(lambda: killed.progress.get("evaluations"))
+    kill(killed)
+    text, _ = runner.communicate(timeout=120)
+    assert runner.returncode == 0 and text.count("ppo_Pendulum-v1_0: started") == 2, text
+    assert_equal(killed, calm)
+
+
+@linux_only
 def test_two_runners_never_train_the_same_run(undisturbed: Path, tmp_path: Path) -> None:
     spec, results = spec_file(tmp_path), tmp_path / "results"
-    td3, mcbs = (folder_of(results, name) for name in NAMES)
-    first = begin(spec, results, "--jobs", "1")
-    wait_for(lambda: trainers_of(td3))
-    second = begin(spec, results, "--jobs", "2")
-    wait_for(lambda: trainers_of(mcbs))
-    texts = [runner.communicate(timeout=120)[0] for runner in (first, second)]
-    assert [f" {TD3}: started" in text for text in texts] == [True, False]
-    assert [f" {MCBS}: started" in text for text in texts] == [False, True]
+    runners = [begin(spec, results, "--jobs", "2") for _ in range(2)]
+    texts = [runner.communicate(timeout=120)[0] for runner in runners]
     for name in NAMES:
+        assert sum(f" {name}: started" in text for text in texts) == 1, texts
+        assert sum(f" {name}: finished" in text for text in texts) == 1, texts
         assert_equal(folder_of(results, name), folder_of(undisturbed / "results", name))
+    # One runner has both runs, or each has one; who is left without work says so.
+    assert 0 in [runner.returncode for runner in runners] or all("to process" in text for text in texts)
 
 
 def engine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str) -> tuple[LocalEngine, Console]:

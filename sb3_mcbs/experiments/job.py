@@ -1,18 +1,21 @@
 """A run while it is looked after: its process, its attempts, how fast it is."""
 
+import ctypes
 import os
 import signal
 import subprocess
 import sys
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from sb3_mcbs.experiments.results import FINISHED, RunFolder
 
 #: Libraries that would otherwise take a thread per core for every run.
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+#: Of prctl: the signal that a process gets when its parent ends.
+_PR_SET_PDEATHSIG = 1
 #: Seconds over which the speed of a run is taken.
 _WINDOW = 60.0
 
@@ -20,9 +23,23 @@ _WINDOW = 60.0
 def command(folder: RunFolder) -> list[str]:
     """
     :param folder: of a run
-    :return: the command that trains it, as a child of this process that ends with it
+    :return: the command that trains it
     """
-    return [sys.executable, "-m", "sb3_mcbs.experiments.train_run", str(folder.path), str(os.getpid())]
+    return [sys.executable, "-m", "sb3_mcbs.experiments.train_run", str(folder.path)]
+
+
+def _ending_with(parent: int) -> Callable[[], None] | None:
+    """What a child process does first so that it ends with its parent, even if that is killed: on Linux."""
+    if not sys.platform.startswith("linux"):
+        return None
+    prctl = ctypes.CDLL(None).prctl
+
+    def end_with_parent() -> None:
+        prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != parent:  # it has ended already
+            os._exit(1)
+
+    return end_with_parent
 
 
 class Job:
@@ -65,6 +82,7 @@ class Job:
                 pass_fds=[self.folder.lock.descriptor],
                 # Ctrl-C in a terminal reaches the runner alone, which passes it on.
                 start_new_session=True,
+                preexec_fn=_ending_with(os.getpid()),
             )
 
     def ask_to_stop(self) -> None:

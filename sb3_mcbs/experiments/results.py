@@ -4,6 +4,7 @@ import fcntl
 import json
 import os
 import socket
+import time
 from pathlib import Path
 from typing import IO, Any
 
@@ -16,6 +17,8 @@ from sb3_mcbs.zoo.manager import CHECKPOINTS
 from sb3_mcbs.zoo.paths import sibling_folder
 
 FINISHED = "finished"
+#: Seconds that another runner may take to set up the folder.
+_PATIENCE = 30.0
 
 
 class ResultsError(RuntimeError):
@@ -166,8 +169,11 @@ def prepare(folder: Path, spec: Spec, runs: list[Run]) -> list[RunFolder]:
     """
     folder.mkdir(parents=True, exist_ok=True)
     lock = Lock(folder / "lock")
-    if not lock.take():
-        raise ResultsError(f"{folder} is being set up by process {lock.holder()}. Try again.")
+    give_up = time.monotonic() + _PATIENCE
+    while not lock.take():  # another runner does the same at this moment
+        if time.monotonic() > give_up:
+            raise ResultsError(f"{folder} has been locked for long by process {lock.holder()}. End that one.")
+        time.sleep(0.1)
     try:
         by_name = {run.name: run for run in runs}
         for path in sorted((folder / "runs").glob("*/run.yml")):

@@ -1,39 +1,28 @@
 """``python -m sb3_mcbs.experiments.train_run RUN_FOLDER``: the process that trains one run."""
 
-import ctypes
-import os
 import shutil
 import signal
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from sb3_mcbs.experiments.results import RunFolder
+import rl_zoo3.train
 
-#: Of prctl: the signal that a process gets when its parent ends.
-_PR_SET_PDEATHSIG = 1
+from sb3_mcbs.experiments.frozen import evaluate_agent
+from sb3_mcbs.experiments.manager import RunManager
+from sb3_mcbs.experiments.plan import Run
+from sb3_mcbs.experiments.results import FINISHED, RunFolder
+from sb3_mcbs.zoo import train
+from sb3_mcbs.zoo.manager import CHECKPOINTS
+from sb3_mcbs.zoo.registration import register
+from sb3_mcbs.zoo.resume import resume
 
 
 def main() -> None:
     """Train the run in the given folder, from its newest exact checkpoint if there is one."""
-    _end_with(int(sys.argv[2]) if len(sys.argv) > 2 else None)
     # Without checkpoints nobody takes over Ctrl-C, and RL Zoo would save a half-trained agent and go on.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     train_run(Path(sys.argv[1]))
-
-
-def _end_with(parent: int | None) -> None:
-    """Let the system kill this process when its parent ends, even if that is killed: on Linux.
-
-    :param parent: the parent's number; None: live on.
-    """
-    if parent is None or not sys.platform.startswith("linux"):
-        return
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:  # it has ended already
-        sys.exit("The process that started this one has ended.")
 
 
 def train_run(path: Path) -> None:
@@ -42,15 +31,10 @@ def train_run(path: Path) -> None:
 
     :param path: its folder
     """
-    # Imported only now: importing takes seconds in which the parent may end.
-    from sb3_mcbs.experiments.frozen import evaluate_agent
-    from sb3_mcbs.experiments.results import FINISHED, RunFolder
-    from sb3_mcbs.zoo.manager import CHECKPOINTS
-
     folder = RunFolder(path)
     run = folder.run()
     if run.agent is None:
-        _train(folder)
+        _train(folder, run)
     else:
         evaluate_agent(folder)
     # Whoever asks for the state of a run believes this line: it is written when all else is there.
@@ -58,27 +42,19 @@ def train_run(path: Path) -> None:
     shutil.rmtree(folder.training(run) / CHECKPOINTS, ignore_errors=True)
 
 
-def _train(folder: "RunFolder") -> None:
-    from sb3_mcbs.experiments.manager import RunManager
-    from sb3_mcbs.zoo import train
-    from sb3_mcbs.zoo.registration import register
-    from sb3_mcbs.zoo.resume import resume
-
+def _train(folder: RunFolder, run: Run) -> None:
     register()
-    import rl_zoo3.train
-
-    RunManager.run, RunManager.folder = folder.run(), folder
+    RunManager.run, RunManager.folder = run, folder
     rl_zoo3.train.ExperimentManager = RunManager  # type: ignore[misc]
-    if folder.has_begun(RunManager.run):
-        resume(folder.training(RunManager.run))
+    if folder.has_begun(run):
+        resume(folder.training(run))
     else:
         shutil.rmtree(folder.logs, ignore_errors=True)
-        sys.argv = ["rl_zoo3.train", *_arguments(folder)]
+        sys.argv = ["rl_zoo3.train", *_arguments(folder, run)]
         train.main()
 
 
-def _arguments(folder: "RunFolder") -> list[str]:
-    run = folder.run()
+def _arguments(folder: RunFolder, run: Run) -> list[str]:
     words = [
         *("--algo", run.algorithm, "--env", run.environment, "--seed", str(run.seed)),
         *("-n", str(run.steps), "--eval-freq", "-1", "--num-threads", "1"),
