@@ -63,7 +63,7 @@ def from_yaml(text: str) -> Run:
     :return: the run
     """
     content = yaml.safe_load(text)
-    agent = content["agent"] and Agent(**content["agent"])
+    agent = content.get("agent") and Agent(**content["agent"])
     return Run(**{**content, "evaluation": Evaluation(**content["evaluation"]), "agent": agent})
 
 
