@@ -23,6 +23,7 @@ from sb3_mcbs.models import (
     make_forward_model,
 )
 from sb3_mcbs.models.engines import INTEGRATION, BatchEngine, ThreadEngine
+from sb3_mcbs.models.mujoco_batch import available_cpus
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 
 RNG = np.random.default_rng(0)
@@ -380,3 +381,11 @@ def test_nothing_outside_is_touched(kind: str, tmp_path: Path) -> None:
             rows.append([(row["r"], row["l"]) for row in csv.DictReader(file)])
     assert len(rows[0]) == 2
     assert rows[0] == rows[1]
+
+
+def test_simulation_takes_no_more_threads_than_omp_num_threads_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    cores = available_cpus()
+    for words, expected in {"1": 1, str(cores + 7): cores, "0": cores, "many": cores}.items():
+        monkeypatch.setenv("OMP_NUM_THREADS", words)
+        assert available_cpus() == expected

@@ -156,5 +156,7 @@ def test_rl_zoos_own_commands_work_in_any_folder(installed: Environment, tmp_pat
     plots = ["-a", "mcbs_td3", "mcbs_td3_actor", "-e", "Pendulum-v1", "-f", "logs", "--no-display"]
     output = installed.run("-m", "rl_zoo3.plots.all_plots", *plots, cwd=tmp_path, MPLBACKEND="agg")
     assert "MCBS_TD3_ACTOR" in output and "Eval not found" not in output
-    report = installed.run("-m", "sb3_mcbs.zoo.cli", "report", "--env", "Pendulum-v1", cwd=tmp_path)
+    report = installed.run("-m", "sb3_mcbs.cli", "report", "--env", "Pendulum-v1", cwd=tmp_path)
     assert "Mean return of the actor alone" in report and "Mean return of the actor with search" in report
+    runs = installed.run("-m", "sb3_mcbs.cli", "experiment", "smoke", "--check", cwd=tmp_path)
+    assert "mcbs_td3_Pendulum-v1_0: mcbs_td3, 3000 steps" in runs

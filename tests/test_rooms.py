@@ -20,6 +20,8 @@ MAY_IMPORT = {
     "checkpoints": ["types", "snapshot", "models", "search", "networks", "agents"],
     "zoo": ["types", "snapshot", "models", "search", "networks", "agents", "loading", "checkpoints"],
 }
+MAY_IMPORT["experiments"] = [*MAY_IMPORT["zoo"], "zoo"]
+MAY_IMPORT["cli"] = [*MAY_IMPORT["experiments"], "experiments"]
 
 
 def imported_rooms(path: Path) -> set[str]:

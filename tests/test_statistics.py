@@ -11,8 +11,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_mcbs import AgentFileError, SearchPolicy, load_agent, load_statistics, save_statistics
-from sb3_mcbs.zoo import cli
+from sb3_mcbs import AgentFileError, SearchPolicy, cli, load_agent, load_statistics, save_statistics
 from sb3_mcbs.zoo.convert_statistics import convert_statistics
 from tests.agent_files import Payload, write
 from tests.conftest import SMALL_SEARCH

@@ -11,8 +11,7 @@ import torch as th
 import yaml
 from rl_zoo3.utils import StoreDict, get_callback_list
 
-from sb3_mcbs import ExactCheckpointCallback
-from sb3_mcbs.zoo import cli
+from sb3_mcbs import ExactCheckpointCallback, cli
 from sb3_mcbs.zoo import repeat as repeating
 from sb3_mcbs.zoo.repeat import RunLoader, command_line, load_run, repeat
 from tests.zoo_helpers import TINY_SEARCH, monitor_rewards, zoo_train

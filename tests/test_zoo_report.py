@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sb3_mcbs.zoo import cli
+from sb3_mcbs import cli
 from sb3_mcbs.zoo.report import ACTOR, SEARCH, load_policies, newest_run, report
 
 

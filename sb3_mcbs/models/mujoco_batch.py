@@ -30,10 +30,11 @@ _FIRST_CAPACITY = 32
 _OF_THE_PARENT: list[Engine] = []
 
 
-def _available_cpus() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+def available_cpus() -> int:
+    """How many processors this process may use: no more than ``OMP_NUM_THREADS`` says to everybody else."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    wanted = os.environ.get("OMP_NUM_THREADS", "")
+    return min(cores, int(wanted)) if wanted.isdecimal() and int(wanted) else cores
 
 
 class MujocoBatchModel(ForwardModel):
@@ -44,8 +45,8 @@ class MujocoBatchModel(ForwardModel):
     :meth:`refresh` after editing it in the environments.
 
     :param environments: the real environments.
-    :param n_threads: simulation threads; 0 uses one per processor that this process may use. The results do
-        not depend on it.
+    :param n_threads: simulation threads; 0 uses one per processor that this process may use, and no more
+        than ``OMP_NUM_THREADS``. The results do not depend on it.
     :raises ForwardModelError: if the environments are not of a known family, or if the model and a
         copy of an environment disagree on random transitions.
     """
@@ -57,7 +58,7 @@ class MujocoBatchModel(ForwardModel):
         if n_threads < 0:
             raise ValueError(f"n_threads must be 0 (all processors) or more, got {n_threads}")
         self._environments = environments
-        self._n_threads = n_threads or _available_cpus()
+        self._n_threads = n_threads or available_cpus()
         self._engine: Engine | None = None
         self._rows = 0
         self.refresh()

@@ -5,6 +5,7 @@ import sys
 
 COMMANDS = {
     "train": ("sb3_mcbs.zoo.train", "train an agent: the arguments of python -m rl_zoo3.train"),
+    "experiment": ("sb3_mcbs.experiments.command", "train all runs of a spec, or go on with them"),
     "resume": ("sb3_mcbs.zoo.resume", "continue a run from its exact checkpoints"),
     "repeat": ("sb3_mcbs.zoo.repeat", "repeat a run from its folder"),
     "report": ("sb3_mcbs.zoo.report", "returns and learning curve of a run's two policies"),
