@@ -1,5 +1,6 @@
 """Shared pieces of the tests."""
 
+import multiprocessing
 from collections.abc import Callable, Iterator
 from copy import deepcopy
 
@@ -18,6 +19,8 @@ from sb3_mcbs.agents import learned_model
 from sb3_mcbs.models import ensemble
 from sb3_mcbs.snapshot import registry, verification
 
+# Workers of environments are forks of a process that has imported this once, not each for itself.
+multiprocessing.set_forkserver_preload(["sb3_mcbs"])
 # Small networks are fastest on one thread, and idle OpenMP threads would take cores from the simulations.
 th.set_num_threads(1)
 

@@ -231,11 +231,12 @@ def test_action_noise_after_search_is_an_option(make_agent, cls):
 
 @pytest.mark.parametrize("cls", SEARCHING)
 def test_logs(make_agent, tmp_path, cls):
-    agent = make_agent("Pendulum-v1", cls=cls, learning_starts=100)
+    env = snapshot_vec_env("Pendulum-v1", env_kwargs=dict(max_episode_steps=50))
+    agent = make_agent(env, cls=cls, learning_starts=25)
     read = logged(agent, tmp_path)
-    agent.learn(400, log_interval=1)
+    agent.learn(100, log_interval=1)
     entries = [entry for entry in read() if entry.get("search/decisions")]
-    assert [entry["search/decisions"] for entry in entries] == [100, 300]
+    assert [entry["search/decisions"] for entry in entries] == [25, 75]
     for entry in entries:
         assert entry["search/model_error"] == 0
         assert entry["search/invalid_rollouts"] == 0

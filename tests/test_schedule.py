@@ -1,5 +1,7 @@
 """When to search: shares of steps and episodes, the paper's saturation rule, and anneals."""
 
+from collections import deque
+
 import numpy as np
 import pytest
 from stable_baselines3 import TD3
@@ -26,15 +28,15 @@ def simulate(return_of, settings: ScheduleSettings, n_steps: int, n_envs: int = 
     """
     schedule, rng = SearchSchedule(settings, seed=0), np.random.default_rng(1)
     schedule.begin_episodes(n_envs, 0)
-    changes, searched = [], np.zeros((0, n_envs))
+    changes, searched = [], deque([np.zeros(n_envs)], maxlen=EPISODE)
     for step in range(n_envs, n_steps, n_envs):
         before = schedule.saturation.is_reduced
         if step > WINDOW:
-            searched = np.concatenate([searched, [schedule.draw(step / n_steps, step)]])
-        ends = np.full(n_envs, (step // n_envs) % EPISODE == 0)
-        total, bonus = return_of(step)
-        share = searched[-EPISODE:].mean(axis=0) if len(searched) else 0.0
-        rewards = np.where(ends, total + bonus * share + noise * rng.normal(size=n_envs), 0.0)
+            searched.append(schedule.draw(step / n_steps, step))
+        rewards, ends = np.zeros(n_envs), np.full(n_envs, (step // n_envs) % EPISODE == 0)
+        if ends.all():
+            total, bonus = return_of(step)
+            rewards = total + bonus * np.mean(searched, axis=0) + noise * rng.normal(size=n_envs)
         schedule.record_rewards(rewards, ends, step)
         if schedule.saturation.is_reduced != before:
             changes.append((step, schedule.saturation.is_reduced))
@@ -412,14 +414,14 @@ def test_generators_go_on_where_a_saved_agent_left_them(make_agent, tmp_path, cl
 @pytest.mark.parametrize("cls, unit", [(MCBSTD3, "step"), *((cls, "episode") for cls in SEARCHING)])
 def test_a_resumed_run_keeps_its_schedule(make_agent, tmp_path, cls, unit):
     def make_env(folder):
-        return VecNormalize(snapshot_vec_env("Pendulum-v1", 2))
+        return VecNormalize(snapshot_vec_env("Pendulum-v1", 2, env_kwargs=dict(max_episode_steps=50)))
 
     def make(folder):
         settings = ScheduleSettings("saturation", 0.8, unit, saturation_window=20)
         return make_agent(make_env(folder), cls=cls, **settings.grouped())
 
-    whole, resumed = assert_resumed_is_exact(make, tmp_path, 1300, 1105, make_env=make_env, save_freq=500)
-    assert whole.n_decisions == resumed.n_decisions > 500
+    whole, resumed = assert_resumed_is_exact(make, tmp_path, 330, 276, make_env=make_env, save_freq=120)
+    assert whole.n_decisions == resumed.n_decisions > 120
     ours, theirs = whole._schedule, resumed._schedule
     assert ours.settings == theirs.settings
     assert ours.rng.bit_generator.state == theirs.rng.bit_generator.state
