@@ -1,4 +1,4 @@
-"""The settings of the search as attributes of an agent: checked, and changed while it learns."""
+"""The settings of the search as attributes of an agent, which are checked and can change during training."""
 
 from copy import deepcopy
 from typing import Any
@@ -20,15 +20,15 @@ from sb3_mcbs.search import SearchSettings, with_preset
 class SearchAttributes(RefusesOldNames):
     """:data:`~sb3_mcbs.agents.hyperparameters.SETTINGS` as attributes of an agent.
 
-    Once the agent is set up, they are checked when they are set, together with all others, and hold from the
-    next decision on::
+    Once the agent is set up, setting one checks it together with all others. It applies from the next
+    decision on::
 
         agent.beam_width = 20
         agent.search_kwargs = {"antithetic": True}
         agent.search_settings = TreeSettings(beam_width=4, branching=3)
         agent.preset = "balanced"
 
-    ``agent.search_kwargs["antithetic"] = True`` is noticed, and checked, at the next decision.
+    ``agent.search_kwargs["antithetic"] = True`` is detected and checked at the next decision.
     """
 
     beam_width: int
@@ -48,7 +48,7 @@ class SearchAttributes(RefusesOldNames):
     expanded_share: float
     action_noise_after_search: bool
     matmul_precision: str | None
-    #: What the dictionaries contained when they were last checked.
+    #: Contents of the dictionaries at the last check.
     _followed: list[dict[str, Any] | None]
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -66,7 +66,7 @@ class SearchAttributes(RefusesOldNames):
 
     @property
     def search_settings(self) -> SearchSettings:
-        """The settings of the search, checked. Another object changes them all at once."""
+        """The checked settings of the search. Assign an object to change them together."""
         return SearchSettings.of(self)
 
     @search_settings.setter
@@ -80,7 +80,7 @@ class SearchAttributes(RefusesOldNames):
 
     @property
     def schedule_settings(self) -> ScheduleSettings:
-        """The settings of the search's schedule, checked. Another object changes them all at once."""
+        """The checked settings of the schedule. Assign an object to change them together."""
         return ScheduleSettings.of(self)
 
     @schedule_settings.setter
@@ -90,11 +90,11 @@ class SearchAttributes(RefusesOldNames):
         self._change_settings(settings.grouped())
 
     def _change_settings(self, changes: dict[str, Any]) -> None:
-        """Change settings and have everything follow, or leave all as it was.
+        """Change settings and apply them, or restore all of them after an error.
 
         :param changes: new values by name.
         :raises TypeError: if a value has the wrong type.
-        :raises ValueError: if a value is out of range or does not go with the others.
+        :raises ValueError: if a value is out of range or does not fit the others.
         """
         attributes = vars(self)
         changes = tidied(changes)
@@ -110,27 +110,27 @@ class SearchAttributes(RefusesOldNames):
             raise
 
     def _note_dictionaries(self) -> None:
-        """Remember what the dictionaries contain, which was checked."""
+        """Remember the checked contents of the dictionaries."""
         vars(self)["_followed"] = deepcopy([getattr(self, group) for group in GROUPS])
         own = {"strategy": self.strategy, "search_kwargs": self.search_kwargs}
         if with_preset(self.preset, own)["search_kwargs"] != self.search_kwargs:
-            # An agent that is made with the same arguments would have what was taken from the preset.
+            # With the preset, an agent made with the same arguments would have keys that were removed here.
             vars(self)["preset"] = None
 
     def _follow_dictionaries(self) -> None:
-        """Follow what was changed within the dictionaries since they were last checked."""
+        """Apply changes inside the dictionaries since the last check."""
         if [getattr(self, group) for group in GROUPS] != self._followed:
             self._follow_settings()
 
     @property
     def _is_set_up(self) -> bool:
-        """Whether settings that change have to be followed."""
+        """Whether changed settings must be applied."""
         raise NotImplementedError
 
     def _follow_settings(self) -> None:
-        """Search with the present settings from the next decision on.
+        """Apply the current settings from the next decision on.
 
         :raises TypeError: if a value has the wrong type.
-        :raises ValueError: if a value is out of range or does not go with the others.
+        :raises ValueError: if a value is out of range or does not fit the others.
         """
         raise NotImplementedError

@@ -1,4 +1,4 @@
-"""Where SB3's training loop meets a replay buffer that rolls critic targets forward in the simulator."""
+"""Connects SB3's training loop with a replay buffer that rolls critic targets forward in the simulator."""
 
 from typing import Any
 
@@ -16,9 +16,9 @@ from sb3_mcbs.search import SearchSettings
 class Expanding(CheckedRollouts):
     """An agent whose critic targets are rolled forward if ``value_expansion`` is above 0.
 
-    Every step of the environments is compared with what the simulator says of it then, searched or not.
+    Every step, searched or not, is then compared with the simulator's prediction.
 
-    :ivar rollout_rng: draws which transitions are expanded, and nothing else does.
+    :ivar rollout_rng: samples the transitions to expand, separately from the agent's generators.
     """
 
     value_expansion: int
@@ -26,7 +26,7 @@ class Expanding(CheckedRollouts):
     n_simulated_steps: int
     rollout_rng: np.random.Generator | None = None
     _keeps_states = False
-    #: The states that the next actions are executed in.
+    #: The states in which the next actions are executed.
     _states: np.ndarray | None = None
 
     def _set_up_expansion(self, settings: SearchSettings) -> None:
@@ -34,9 +34,9 @@ class Expanding(CheckedRollouts):
         self._keeps_states = self.value_expansion > 0
 
     def _follow_expansion(self, settings: SearchSettings) -> None:
-        """Refuse changed settings that need other arrays beside the replay buffer than there are.
+        """Refuse changed settings that need other arrays in the replay buffer.
 
-        :param settings: of the search.
+        :param settings: settings of the search.
         """
         self._check_expansion(settings)
         if (self.value_expansion > 0) != self._keeps_states:
@@ -57,19 +57,20 @@ class Expanding(CheckedRollouts):
             batched_states(self)
 
     def _expand_buffer(self) -> None:
-        """Whoever loads a replay buffer exchanges it, so this is done before every use."""
+        """Convert the replay buffer, before every use, since loading one replaces it."""
         if self.value_expansion:
             assert self.replay_buffer is not None
             expand(self.replay_buffer, self)
 
     def _note_states(self) -> None:
-        """The environments are about to be stepped."""
+        """Keep the environments' states before a step."""
         self._states = batched_states(self) if self.value_expansion else None
 
     def _predict_step(self, actions: np.ndarray) -> Prediction | None:
-        """Simulate the step that the environments have just done.
+        """Simulate the last step of the environments.
 
         :param actions: ``[n_envs, act_dim]``, scaled.
+        :return: ``None`` without value expansion or a deterministic forward model.
         """
         if self._states is None:
             return None
