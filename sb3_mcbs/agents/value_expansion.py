@@ -86,8 +86,8 @@ class ValueExpansionSettings(CheckedSettings):
         """
         if self.value_expansion and optimize_memory_usage:
             raise ValueError(
-                "value_expansion goes on from the last observation of a transition, which a replay buffer "
-                "with optimize_memory_usage does not keep at the end of an episode: leave that out."
+                "value_expansion needs the last observation of every transition, which a replay buffer with "
+                "optimize_memory_usage does not keep at the end of an episode: leave that out."
             )
 
 
