@@ -4,16 +4,16 @@ from typing import Any
 
 import numpy as np
 
-#: Actions that are remembered, and how many are needed before directions are learned from them.
+#: Number of remembered actions, and how many are needed to learn directions.
 RECENT, ENOUGH = 1000, 100
-#: A direction whose variance is below this share of the largest is none.
+#: Directions whose variance is below this fraction of the largest are ignored.
 _NEGLIGIBLE = 1e-6
 
 
 class RecentActions:
-    """The last actions that an agent executed, in all its environments and episodes.
+    """An agent's last executed actions, in all its environments and episodes.
 
-    :param act_dim: entries of one action.
+    :param act_dim: action dimensions.
     """
 
     def __init__(self, act_dim: int) -> None:
@@ -24,7 +24,7 @@ class RecentActions:
         return min(self._count, RECENT)
 
     def note(self, actions: np.ndarray) -> None:
-        """Remember actions in place of the oldest ones.
+        """Store actions in place of the oldest ones.
 
         :param actions: ``[n, act_dim]``, scaled, as executed.
         """
@@ -35,9 +35,9 @@ class RecentActions:
     def directions(self, n_directions: int) -> np.ndarray | None:
         """Find the principal directions: those in which the actions vary most around their mean.
 
-        :param n_directions: how many.
+        :param n_directions: number of directions.
         :return: ``[n_directions, act_dim]``, orthonormal; ``None`` while fewer than ``ENOUGH`` actions are
-            known, or if they vary in fewer directions than that.
+            known, or if they vary in fewer directions.
         """
         if len(self) < ENOUGH:
             return None
@@ -49,11 +49,11 @@ class RecentActions:
         return axes[:, ::-1][:, :n_directions].T.astype(np.float32)
 
     def state(self) -> dict[str, Any]:
-        """What :meth:`set_state` takes, as plain values."""
+        """The state for :meth:`set_state`, as plain values."""
         return {"actions": self._actions.copy(), "count": self._count}
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Remember what another memory did.
+        """Restore a state.
 
         :param state: from :meth:`state`.
         """
@@ -62,7 +62,7 @@ class RecentActions:
 
 
 def gain(directions: np.ndarray | None) -> float:
-    """What noise along directions is multiplied by, so that its total variance is that in all directions.
+    """The factor that gives noise along directions the total variance of noise in all directions.
 
     :param directions: ``[n_directions, act_dim]``, orthonormal; ``None`` is all.
     """
@@ -72,18 +72,18 @@ def gain(directions: np.ndarray | None) -> float:
 def combine(coordinates: np.ndarray, directions: np.ndarray | None) -> np.ndarray:
     """Turn coordinates along directions into actions.
 
-    :param coordinates: ``[..., act_dim]``, of which only the first ``n_directions`` count.
-    :param directions: ``[n_directions, act_dim]``; ``None``: coordinates are the entries of actions.
+    :param coordinates: ``[..., act_dim]``, of which only the first ``n_directions`` are used.
+    :param directions: ``[n_directions, act_dim]``; ``None``: coordinates are actions already.
     :return: ``[..., act_dim]``.
     """
     return coordinates if directions is None else coordinates[..., : len(directions)] @ directions
 
 
 def low_dimensional(noise: np.ndarray, directions: np.ndarray | None) -> np.ndarray:
-    """Turn noise in all directions into noise in some, of the same total variance.
+    """Turn noise in all directions into noise in some, with the same total variance.
 
     :param noise: ``[..., act_dim]``, independent entries of equal standard deviation.
-    :param directions: ``[n_directions, act_dim]``, orthonormal; ``None`` leaves it as it is.
+    :param directions: ``[n_directions, act_dim]``, orthonormal; ``None`` leaves it unchanged.
     :return: ``[..., act_dim]``.
     """
     return noise if directions is None else combine(noise, np.float32(gain(directions)) * directions)
