@@ -1,37 +1,37 @@
-"""What the cross-entropy method remembers from one decision to the next."""
+"""Warm start of the cross-entropy method: plans remembered between decisions."""
 
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-#: When a decision was made: how often its environment had been reset or restored, and the steps since then.
+#: Identifies the time of a decision: number of resets and restores of the environment, and steps since then.
 EpisodeClock = tuple[int, int]
 
 
 class WarmStart:
-    """The plan that was followed last in every environment.
+    """The last plan of every environment.
 
-    A plan is for the steps right after its decision. It is recalled for what is left of it then, and not at
-    all if the environment was reset or restored since.
+    A plan covers the steps after its decision. The rest of it is recalled later, unless the environment was
+    reset or restored since.
 
     :param n_envs: number of environments.
     :param horizon: environment steps of a plan.
-    :param act_dim: entries of one action.
+    :param act_dim: action dimensions.
     """
 
     def __init__(self, n_envs: int, horizon: int, act_dim: int) -> None:
-        #: By environment step: a decision's macro-steps need not begin where those of the last one did.
+        #: By environment step, since macro-steps of later decisions may start at other steps.
         self._plans = np.zeros((n_envs, horizon, act_dim), dtype=np.float32)
         self._episode_clocks: list[EpisodeClock | None] = [None] * n_envs
 
     def recall(self, envs: Sequence[int], now: Sequence[EpisodeClock], noise_hold: int = 1) -> np.ndarray:
         """Shift the plans by the steps since their decisions.
 
-        :param envs: the environments that decide.
-        :param now: the present moment of each.
+        :param envs: indices of the environments.
+        :param now: the current episode clock of each.
         :param noise_hold: environment steps in a macro-step.
-        :return: ``[len(envs), rollout_depth, act_dim]``, by macro-steps; 0 where nothing is left.
+        :return: ``[len(envs), rollout_depth, act_dim]``, by macro-steps; 0 beyond the remembered plan.
         """
         horizon = self._plans.shape[1]
         recalled = np.zeros((len(envs), *self._plans.shape[1:]), dtype=self._plans.dtype)
@@ -44,8 +44,8 @@ class WarmStart:
         """Remember the plans of a decision.
 
         :param plans: ``[len(envs), rollout_depth, act_dim]``, by macro-steps.
-        :param envs: the environments that decided.
-        :param now: the present moment of each.
+        :param envs: indices of the environments.
+        :param now: the current episode clock of each.
         """
         by_step = np.repeat(plans, self._plans.shape[1] // plans.shape[1], axis=1)
         for plan, env, moment in zip(by_step, envs, now, strict=True):
@@ -61,18 +61,18 @@ class WarmStart:
         ]
 
     def state(self, now: Sequence[EpisodeClock]) -> dict[str, Any]:
-        """What :meth:`set_state` takes, as plain values that do not depend on how often was reset.
+        """The state for :meth:`set_state`, as plain values that do not depend on the number of resets.
 
-        :param now: the present moment of every environment.
-        :return: the plans, and their ages.
+        :param now: the current episode clock of every environment.
+        :return: the plans and their ages.
         """
         return {"plans": self._plans.copy(), "ages": self._ages(range(len(now)), now)}
 
     def set_state(self, state: dict[str, Any], now: Sequence[EpisodeClock]) -> None:
-        """Remember what another memory did.
+        """Restore a state.
 
         :param state: from :meth:`state`.
-        :param now: the present moment of every environment, which are in the states of then.
+        :param now: the current episode clock of every environment, each in its state at that time.
         """
         self._plans[:] = state["plans"]
         self._episode_clocks = [
