@@ -160,7 +160,7 @@ class VecCheckFinite(VecEnvWrapper):
         env_index, what = reason
         raise NonFiniteError(
             f"Environment {env_index} returned {what} after the action {self._actions[env_index].tolist()}. "
-            "The transition was not stored. Find out with this action what the environment computes there "
+            "The transition was not stored. Check what the environment computes with this action "
             "(stable_baselines3.common.env_checker.check_env helps), and let it end the episode instead."
         )
 

@@ -41,7 +41,7 @@ class Expanding(CheckedRollouts):
         self._check_expansion(settings)
         if (self.value_expansion > 0) != self._keeps_states:
             raise ValueError(
-                "value_expansion keeps states beside the replay buffer: it can be changed later, but not "
+                "value_expansion stores states in the replay buffer: it can be changed later, but not "
                 "from or to 0; save the agent, and load it with the other settings."
             )
 

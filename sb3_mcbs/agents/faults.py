@@ -81,8 +81,8 @@ def check_observations(observations: Any) -> None:
     broken = broken_row(observations)
     if broken is not None:
         raise NonFiniteError(
-            f"Environment {broken[0]} is in a state whose observation is not finite: {broken[1]}. Find out "
-            "what its reset, or its last step, computes there "
+            f"Environment {broken[0]} is in a state whose observation is not finite: {broken[1]}. Check "
+            "what its reset or its last step computes "
             "(stable_baselines3.common.env_checker.check_env helps)."
         )
 
@@ -102,13 +102,13 @@ def check_networks(
     check_observations(observations)
     actions = policy(observations)
     if not is_finite(actions):
-        answer = "The actor answers"
+        answer = "The actor returns"
     elif not is_finite(value(observations, actions)):
-        answer = "The critics answer"
+        answer = "The critics return"
     else:
         return
     raise NonFiniteError(
-        f"{answer} the present observations with NaN or infinity: the networks have diverged, and no action "
+        f"{answer} NaN or infinity for the current observations: the networks have diverged, and no action "
         "can be chosen. Go back to an agent that was saved earlier, and train with a lower "
         "learning_rate, or with rewards and observations on a smaller scale (VecNormalize)."
     )

@@ -41,7 +41,7 @@ REMOVED: dict[str, tuple[Any, str]] = {
     "rollout_replay": (0.0, "learning from the search's rollouts brought nothing; value_expansion may"),
     "entropy_bonus": (False, "the search adds no entropy to values; it cost returns"),
     "tqc_value": ("mean", "TQC's value is always the mean over all quantiles"),
-    "common_noise": (False, "the later actions of every rollout have noise of their own; see antithetic"),
+    "common_noise": (False, "the later actions of every rollout have their own noise; see antithetic"),
     "one_node_per_root": (False, "a tree keeps its best nodes, whichever root action they grew from"),
 }
 #: Settings that were keywords, and the dictionary that contains them now.

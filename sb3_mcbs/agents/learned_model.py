@@ -104,7 +104,7 @@ class LearnedModel:
         if settings.ensemble_size != size:
             raise ValueError(
                 f"ensemble_size is {settings.ensemble_size}, and this agent has learned a model of {size} "
-                "networks: leave it as it was."
+                "networks: do not change it."
             )
         if getattr(agent.replay_buffer, "optimize_memory_usage", False):
             raise ValueError(

@@ -167,7 +167,7 @@ class Planner:
         """
         if not isinstance(self.source, ExactRoots):
             raise ForwardModelError(
-                f"no states of environments can be read; here simulates: {self.description}"
+                f"States of environments cannot be read; the forward model is: {self.description}"
             )
         return self.source.read_states(self._all_envs)
 

@@ -183,7 +183,7 @@ class ExactRoots(RootSource):
                 "The observations to act on are not those of the environments' present states. A search "
                 "plans from the environments it was given: act in those, step them only through their "
                 "SnapshotEnvWrapper, and keep wrappers that alter observations inside it. A callback needs "
-                "environments of its own: EvalCallback(make_vec_env(...)), not "
+                "its own environments: EvalCallback(make_vec_env(...)), not "
                 "EvalCallback(model.get_env()). If they were used for something else between two calls of "
                 "learn, call set_env before the second."
             )
@@ -232,13 +232,13 @@ class ExactRoots(RootSource):
         if not self._previous_step_differed:
             try:
                 self.model.refresh()
-                _warn(message + "It was edited; the forward model was rebuilt from its present values.")
+                _warn(message + "It was edited; the forward model was rebuilt from its current values.")
                 return
             except ForwardModelError as reason:
                 message += f"{reason} "
         if self.settings.forward_model != "auto":
             raise ForwardModelError(
-                message + "forward_model='pool' copies whole environments and can follow."
+                message + "forward_model='pool' copies whole environments and can simulate them."
             )
         self._simulate_with("pool")
         _warn(message + f"Now simulating with: {self.model.description}.")

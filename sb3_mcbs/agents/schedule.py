@@ -97,8 +97,8 @@ class ScheduleSettings(CheckedSettings):
                 )
             if self.recovery_tolerance <= self.saturation_tolerance:
                 raise ValueError(
-                    "recovery_tolerance must be above saturation_tolerance, or the schedule would go to and "
-                    f"fro; got {self.recovery_tolerance} and {self.saturation_tolerance}."
+                    "recovery_tolerance must be above saturation_tolerance, or the schedule would "
+                    f"oscillate; got {self.recovery_tolerance} and {self.saturation_tolerance}."
                 )
 
     @property
@@ -138,8 +138,8 @@ class ScheduleSettings(CheckedSettings):
         most = settings.max_beam_width if isinstance(settings, BeamSettings) else None
         if self.final_beam_width is not None and most is not None:
             raise ValueError(
-                "final_beam_width has no meaning with max_beam_width, which is the number of candidates that "
-                "is enough: leave one of the two out."
+                "final_beam_width has no meaning with max_beam_width, which already limits the number of "
+                "candidates: leave one of the two out."
             )
         end = self.annealed(settings, progress=1.0)
         largest = {name: max(getattr(settings, name), value) for name, value in end.items()}

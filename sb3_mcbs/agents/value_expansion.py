@@ -285,7 +285,7 @@ def batched_states(agent: Any) -> np.ndarray:
     if not _is_batched(planner.model):  # reading may have replaced the forward model
         raise ForwardModelError(
             "value_expansion keeps the simulator's states in the replay buffer, which needs batched "
-            f"MuJoCo; here simulates: {planner.description}. Leave value_expansion out."
+            f"MuJoCo; the forward model is: {planner.description}. Leave value_expansion out."
         )
     return np.stack(states)
 

@@ -55,7 +55,7 @@ class BeamSettings(SearchSettings):
                 )
 
     def distinct_simulations(self, deterministic: bool) -> int:
-        # Only Algorithm 1 draws the later actions of each simulation anew.
+        # Only Algorithm 1 draws separate noise for each simulation.
         noisy = self.is_noisy(self.effective_rollout_noise)
         return self.n_simulations if noisy else super().distinct_simulations(deterministic)
 
