@@ -20,7 +20,7 @@ def main() -> None:
         lines = [f"  {command:18} {text}" for command, (_, text) in COMMANDS.items()]
         print("\n".join(["usage: sb3-mcbs COMMAND [ARGUMENTS]", "", *lines]))
         sys.exit(0 if name in ("-h", "--help") else f"sb3-mcbs: unknown command {name!r}" if name else 2)
-    # The command sees itself as the program, as after python -m.
+    # The command sees its own name as the program, as with python -m.
     sys.argv = [f"sb3-mcbs {name}", *sys.argv[2:]]
     importlib.import_module(COMMANDS[name][0]).main()
 

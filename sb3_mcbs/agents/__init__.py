@@ -1,4 +1,4 @@
-"""Agents of Stable-Baselines3 that search before they act, and acting with search with any of its agents."""
+"""Stable-Baselines3 agents that search before they act, and search around trained agents."""
 
 from sb3_mcbs.agents.learned_model import EnsembleSettings
 from sb3_mcbs.agents.mcbs import MCBS

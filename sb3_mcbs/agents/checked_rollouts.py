@@ -1,4 +1,4 @@
-"""Collecting rollouts as SB3 does, except that nothing broken is learned from."""
+"""Collects rollouts as SB3 does, but does not store faulty steps."""
 
 import inspect
 import logging
@@ -26,19 +26,19 @@ logger = logging.getLogger("sb3_mcbs")
 class CheckedRollouts(OffPolicyAlgorithm):
     """An agent whose environments are checked at every step.
 
-    Numbers that are not finite end the training with an error. A step in which a simulation diverged is not
-    stored, and neither is the one in which a callback stopped the training, which SB3 does not store either;
-    what is stored before and after it is kept apart.
+    Values that are not finite end the training with an error. A step in which a simulation diverged is not
+    stored, nor, as in SB3, the step in which a callback stopped the training. The steps before and after it
+    are kept apart.
     """
 
-    #: The number of steps in which a simulation diverged.
+    #: Number of steps in which a simulation diverged.
     n_diverged_steps = 0
     _checked_env: "VecCheckFinite | None" = None
 
     def collect_rollouts(self, env: VecEnv, *args: Any, **kwargs: Any) -> RolloutReturn:
         if self._checked_env is None or self._checked_env.venv is not env:
             self._checked_env = VecCheckFinite(env)
-        self._leave_out_unstored()  # of a training that goes on in another agent, if a callback copied it
+        self._leave_out_unstored()  # left from the original's step, if a callback copied this agent
         try:
             return super().collect_rollouts(self._checked_env, *args, **kwargs)
         finally:
@@ -91,25 +91,25 @@ class CheckedRollouts(OffPolicyAlgorithm):
             self._store_valid_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
     def _store_valid_transition(self, *transition: Any) -> None:
-        """Store a step of which nothing is left out.
+        """Store a step without faults.
 
         :param transition: the arguments of :meth:`_store_transition`.
         """
         super()._store_transition(*transition)
 
     def _record_rewards(self, reward: np.ndarray, dones: np.ndarray) -> None:
-        """A step was done, whether it is stored or not.
+        """Record a step, whether it is stored or not.
 
-        :param reward: ``[n_envs]``, as the agent was given them.
+        :param reward: ``[n_envs]``, as the agent got them.
         :param dones: ``[n_envs]``, whether an episode ended.
         """
 
     def _begin_episodes(self) -> None:
-        """All environments were reset."""
+        """Begin new episodes after a reset of all environments."""
 
 
 class VecCheckFinite(VecEnvWrapper):
-    """Environments whose observations and rewards are checked before anyone else sees them.
+    """Checks observations and rewards before callbacks or the agent see them.
 
     :param venv: the environments, with all their wrappers.
 
@@ -123,7 +123,7 @@ class VecCheckFinite(VecEnvWrapper):
         self._actions = np.zeros(0)
 
     def __getstate__(self) -> dict[str, Any]:
-        # SB3's wrappers note what their class has, which cannot be copied.
+        # SB3's wrappers keep the members of their class, which cannot be copied.
         return {name: value for name, value in vars(self).items() if name != "class_attributes"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -139,8 +139,8 @@ class VecCheckFinite(VecEnvWrapper):
     def step_wait(self) -> VecEnvStepReturn:
         """Step the environments.
 
-        :raises NonFiniteError: if an observation or a reward is not finite. The statistics of a
-            ``VecNormalize`` are then as before the step.
+        :raises NonFiniteError: if an observation or a reward is not finite. The statistics of
+            ``VecNormalize`` are then restored.
         """
         normalizer = self._normalizer
         before = None if normalizer is None else _Statistics(normalizer)
@@ -160,13 +160,13 @@ class VecCheckFinite(VecEnvWrapper):
         env_index, what = reason
         raise NonFiniteError(
             f"Environment {env_index} returned {what} after the action {self._actions[env_index].tolist()}. "
-            "The transition was not stored. Find out with this action what the environment computes there "
+            "The transition was not stored. Check what the environment computes with this action "
             "(stable_baselines3.common.env_checker.check_env helps), and let it end the episode instead."
         )
 
 
 class _Statistics:
-    """The statistics of a ``VecNormalize`` at one moment, which it replaces rather than changes."""
+    """A snapshot of ``VecNormalize`` statistics: references suffice, since updates create new arrays."""
 
     def __init__(self, normalizer: VecNormalize) -> None:
         observations = getattr(normalizer, "obs_rms", {})
@@ -186,9 +186,9 @@ class _Statistics:
 def _what_is_not_finite(
     observations: Any, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]
 ) -> tuple[int, str] | None:
-    """Find an environment that returned numbers that are not finite.
+    """Find an environment that returned values that are not finite.
 
-    :return: its index, and what it returned; None if all is well.
+    :return: its index, and what it returned; None if all values are finite.
     """
     if not is_finite(rewards):
         index = int(np.flatnonzero(~np.isfinite(rewards))[0])
@@ -207,33 +207,32 @@ def _what_is_not_finite(
 
 
 def break_trajectories(buffer: ReplayBuffer) -> None:
-    """Keep what is stored next apart from what was stored last.
+    """Separate the last stored step from the next one.
 
-    To be called when a step is left out: otherwise returns over several steps, and goals from the future of
-    an episode, would reach across the gap. What was stored last then counts as truncated, so that its
-    value is still bootstrapped.
+    Call this when a step is left out. Otherwise n-step returns, and goals from the future of an episode,
+    would cross the gap. The last stored step then counts as truncated, so its target still bootstraps.
 
-    :param buffer: where a step is left out for all environments.
+    :param buffer: the replay buffer, in which a step is left out for all environments.
     """
     if buffer.pos == 0 and not buffer.full:
         return
-    last = buffer.pos - 1  # -1 is the last row, if the buffer has just begun anew
+    last = buffer.pos - 1  # -1 is the last row, if the buffer has just wrapped around
     for env in np.flatnonzero(buffer.dones[last] == 0).tolist():
         buffer.dones[last, env] = 1
-        # A buffer without room of its own for next observations loses this one: no value can follow.
+        # A buffer without separate next observations loses this one, so it cannot bootstrap.
         buffer.timeouts[last, env] = not buffer.optimize_memory_usage
         if isinstance(buffer, HerReplayBuffer):
             buffer._compute_episode_length(env)
 
 
 def leave_out_step(agent: OffPolicyAlgorithm, buffer: ReplayBuffer, new_obs: Any) -> None:
-    """Go on after a step that is not stored.
+    """Continue after a step that is not stored.
 
     A row of the buffer holds the step of all environments, so it is left out for all.
 
-    :param agent: the agent that did the step.
-    :param buffer: where it would be stored.
-    :param new_obs: ``[n_envs, *]``, what the agent acts on next.
+    :param agent: the agent that took the step.
+    :param buffer: the agent's replay buffer.
+    :param new_obs: ``[n_envs, *]``, the agent's next observations.
     """
     break_trajectories(buffer)
     agent._last_obs = new_obs
@@ -242,11 +241,11 @@ def leave_out_step(agent: OffPolicyAlgorithm, buffer: ReplayBuffer, new_obs: Any
 
 
 def warn_of_divergence(actions: np.ndarray, diverged: list[int], step: int) -> None:
-    """Tell the user that the simulation of an environment diverged for the first time.
+    """Warn that the simulation of an environment diverged for the first time.
 
     :param actions: ``[n_envs, act_dim]`` in [-1, 1].
-    :param diverged: the environments.
-    :param step: how many steps were done.
+    :param diverged: indices of the environments.
+    :param step: environment steps so far.
     """
     env = diverged[0]
     message = (

@@ -1,4 +1,4 @@
-"""What the logger of an agent is told of its decisions."""
+"""Logs an agent's decisions."""
 
 from typing import Any
 
@@ -8,12 +8,12 @@ from sb3_mcbs.search import BeamSettings, SearchResult, SearchSettings
 
 
 def record_decision(agent: Any, result: SearchResult, seconds: float, settings: SearchSettings) -> None:
-    """Count a decision, and write what it found to the agent's logger.
+    """Count a decision, and write its result to the agent's logger.
 
     :param agent: an :class:`~sb3_mcbs.MCBS` agent.
-    :param result: of the search.
-    :param seconds: that the decision took.
-    :param settings: of this decision.
+    :param result: the search's result.
+    :param seconds: duration of the decision.
+    :param settings: settings of this decision.
     """
     n_envs = len(result.chosen)
     agent.n_decisions += n_envs
@@ -23,7 +23,7 @@ def record_decision(agent: Any, result: SearchResult, seconds: float, settings: 
     searched = result.chosen >= 0
     values = result.values[searched]
     if values.size and np.isfinite(values).all():
-        # In a tree the chosen root is that of the best leaf, which need not be the best root.
+        # In a tree the chosen root belongs to the best leaf, and need not have the best value.
         best = np.take_along_axis(values, result.chosen[searched][:, None], axis=1)[:, 0]
         agent.logger.record_mean("search/value_gain", float((best - values.mean(axis=1)).mean()))
         agent.logger.record_mean("search/beam_std", float(values.std(axis=1).mean()))

@@ -1,4 +1,4 @@
-"""How an agent that does not search at every step explores at the others."""
+"""Exploration at steps without search."""
 
 import logging
 
@@ -12,11 +12,12 @@ logger = logging.getLogger("sb3_mcbs")
 
 
 def noise_without_search(agent: OffPolicyAlgorithm, noise: float, say: bool = True) -> ActionNoise | None:
-    """The noise of a deterministic actor for what is not searched, if it has none of its own.
+    """Make noise for a deterministic actor's steps without search, if it has no ``action_noise``.
 
     :param agent: an agent that does not search at every step.
     :param noise: standard deviation of Gaussian noise, in the action space scaled to [-1, 1].
-    :param say: whether the user is told.
+    :param say: whether to inform the user.
+    :return: ``None`` if the agent needs none.
     """
     if agent.action_noise is not None or isinstance(agent, SAC | TQC):
         return None
@@ -34,11 +35,11 @@ def noise_without_search(agent: OffPolicyAlgorithm, noise: float, say: bool = Tr
 
 
 class DrawnNoise(ActionNoise):
-    """Noise that remembers what it drew last.
+    """Noise that keeps its last sample.
 
-    :param noise: the noise.
+    :param noise: the noise to sample from.
 
-    :ivar last: what it drew last.
+    :ivar last: the last sample.
     """
 
     def __init__(self, noise: ActionNoise) -> None:

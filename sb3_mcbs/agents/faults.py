@@ -1,4 +1,4 @@
-"""What goes wrong in environments, networks and simulations: noticed and named."""
+"""Detects and reports faults of environments, networks and simulations."""
 
 import logging
 import math
@@ -26,17 +26,17 @@ _LOOPS_OVER_ENVIRONMENTS = (DummyVecEnv.step_wait.__code__, DummyVecEnv.reset.__
 
 
 class NonFiniteError(ValueError):
-    """An environment or a network gave a number that is NaN or infinite."""
+    """An environment or a network returned NaN or infinity."""
 
 
 @contextmanager
 def environment_named(vec_env: VecEnv) -> Iterator[None]:
-    """Say of an error which of several environments it came from.
+    """Add to an error which environment it came from.
 
-    An error of an environment in this process is raised as it is, with a note.
+    An error of an environment in this process is raised unchanged, with a note.
 
-    :param vec_env: the environments that are stepped inside.
-    :raises WorkerError: if the worker process of an environment has ended; one that hangs is not noticed.
+    :param vec_env: the environments that are stepped inside the context.
+    :raises WorkerError: if the worker process of an environment has ended; a hanging one is not detected.
     :raises ValueError: see :func:`check_whole`.
     """
     check_whole(vec_env)
@@ -57,7 +57,7 @@ def environment_named(vec_env: VecEnv) -> Iterator[None]:
 
 
 def check_whole(vec_env: VecEnv) -> None:
-    """Refuse wrappers around nothing.
+    """Refuse wrappers without environments.
 
     :param vec_env: the environments.
     :raises ValueError: if there are none, as in a copy of a ``VecNormalize``.
@@ -81,8 +81,8 @@ def check_observations(observations: Any) -> None:
     broken = broken_row(observations)
     if broken is not None:
         raise NonFiniteError(
-            f"Environment {broken[0]} is in a state whose observation is not finite: {broken[1]}. Find out "
-            "what its reset, or its last step, computes there "
+            f"Environment {broken[0]} is in a state whose observation is not finite: {broken[1]}. Check "
+            "what its reset or its last step computes "
             "(stable_baselines3.common.env_checker.check_env helps)."
         )
 
@@ -92,30 +92,30 @@ def check_networks(
     value: Callable[[Observations, np.ndarray], np.ndarray],
     observations: Observations,
 ) -> None:
-    """Tell networks that diverged from rollouts that did.
+    """Check whether networks, rather than rollouts, have diverged.
 
     :param policy: the actor.
     :param value: the critics.
-    :param observations: ``[n_envs, *]``, present observations.
-    :raises NonFiniteError: if it is the networks, or the environments.
+    :param observations: ``[n_envs, *]``, current observations.
+    :raises NonFiniteError: if the networks' outputs, or the observations, are not finite.
     """
     check_observations(observations)
     actions = policy(observations)
     if not is_finite(actions):
-        answer = "The actor answers"
+        answer = "The actor returns"
     elif not is_finite(value(observations, actions)):
-        answer = "The critics answer"
+        answer = "The critics return"
     else:
         return
     raise NonFiniteError(
-        f"{answer} the present observations with NaN or infinity: the networks have diverged, and no action "
+        f"{answer} NaN or infinity for the current observations: the networks have diverged, and no action "
         "can be chosen. Go back to an agent that was saved earlier, and train with a lower "
         "learning_rate, or with rewards and observations on a smaller scale (VecNormalize)."
     )
 
 
 class InvalidDecisions:
-    """Tells of decisions in a row in which every simulation was invalid: after 10, 100, 1000, ..."""
+    """Warns of consecutive decisions in which every simulation was invalid: after 10, 100, 1000, ..."""
 
     def __init__(self) -> None:
         self._in_a_row = 0
@@ -124,8 +124,8 @@ class InvalidDecisions:
     def note(self, result: SearchResult, model: ForwardModel | None) -> None:
         """Count a decision.
 
-        :param result: of the search.
-        :param model: what simulated; ``None`` if nothing did.
+        :param result: the search's result.
+        :param model: the forward model; ``None`` if nothing was simulated.
         """
         if (result.chosen >= 0).any() or not result.invalid_rollouts:
             self._in_a_row = 0
@@ -151,9 +151,9 @@ class InvalidDecisions:
 
 
 def is_finite(values: np.ndarray) -> bool:
-    """Whether all numbers are; quicker than asking for each, since a sum is finite only if its terms are.
+    """Whether all values are finite; checks the sum first, which is faster.
 
-    :param values: of any shape.
+    :param values: array of any shape.
     """
     return bool(math.isfinite(values.sum(dtype=np.float64)) or np.isfinite(values).all())
 
@@ -162,7 +162,7 @@ def broken_row(observations: Any) -> tuple[int, str] | None:
     """Find an environment whose observation is not finite.
 
     :param observations: ``[n_envs, *]``, or a dict of such arrays.
-    :return: its index, and the observation in words.
+    :return: its index, and the observation as text.
     """
     if isinstance(observations, dict):
         return next(filter(None, (broken_row(values) for values in observations.values())), None)

@@ -12,8 +12,8 @@ from sb3_mcbs.search import BeamSettings, SearchSettings, make_settings, with_pr
 from sb3_mcbs.search.checks import as_dict
 from sb3_mcbs.search.settings import OF_THE_MACHINE, STRATEGIES, present_name
 
-#: What an agent's constructor takes besides SB3's parameters, as attributes of the same names: the defaults
-#: without a preset. ``None`` is a dictionary without keys.
+#: An agent's constructor parameters besides SB3's, and their defaults without a preset. The agent has them as
+#: attributes. ``None`` is a dictionary without keys.
 SETTINGS: dict[str, Any] = {
     "beam_width": 6,
     "rollout_depth": 3,
@@ -34,18 +34,18 @@ SETTINGS: dict[str, Any] = {
     "matmul_precision": None,
 }
 GROUPS = ("search_kwargs", "schedule_kwargs", "model_kwargs")
-#: What a preset may say: ``None`` in the signature of a constructor, since any number may have been given.
+#: Settings of presets: their default in the constructors is ``None``, which means not given.
 _OF_PRESETS = ("beam_width", "rollout_depth", "n_simulations", "beam_noise", "strategy")
 
-#: Settings that there once were: what their default was, and what there is instead.
+#: Removed settings: their former default, and the reason or replacement.
 REMOVED: dict[str, tuple[Any, str]] = {
     "rollout_replay": (0.0, "learning from the search's rollouts brought nothing; value_expansion may"),
     "entropy_bonus": (False, "the search adds no entropy to values; it cost returns"),
     "tqc_value": ("mean", "TQC's value is always the mean over all quantiles"),
-    "common_noise": (False, "the later actions of every rollout have noise of their own; see antithetic"),
+    "common_noise": (False, "the later actions of every rollout have their own noise; see antithetic"),
     "one_node_per_root": (False, "a tree keeps its best nodes, whichever root action they grew from"),
 }
-#: Settings that once were keywords themselves, and what they are part of now.
+#: Settings that were keywords, and the dictionary that contains them now.
 MOVED: dict[str, str] = {
     **dict.fromkeys(("rollout_noise", "noise_clip", "include_policy_action", "n_proposals"), "search_kwargs"),
     **dict.fromkeys(("antithetic", "noise_hold", "proposal_dims", "time_budget"), "search_kwargs"),
@@ -58,7 +58,7 @@ MOVED: dict[str, str] = {
 
 
 class RefusesOldNames:
-    """Says where a setting went that is given to the constructor as it once was."""
+    """Refuses removed and moved settings in the constructor, and names the replacement."""
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
         refuse_old_names(kwargs)
@@ -76,11 +76,11 @@ def sb3_arguments(arguments: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def complete_settings(arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """All settings of an agent.
+    """Complete the settings of an agent.
 
-    :param arguments: of its constructor, SB3's among them.
+    :param arguments: of its constructor, including SB3's.
     :return: the value of each of :data:`SETTINGS`.
-    :raises TypeError: if settings that should be a dictionary are none.
+    :raises TypeError: if a dictionary of settings is not a dictionary.
     :raises ValueError: if there is no such preset.
     """
     given = {name: value for name, value in arguments.items() if name in SETTINGS}
@@ -91,11 +91,11 @@ def complete_settings(arguments: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def tidied(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings as an agent keeps them.
+    """Bring settings into the form in which an agent keeps them.
 
     :param settings: by name.
-    :return: the same with copies of dictionaries, and a strategy's present name.
-    :raises TypeError: if settings that should be a dictionary are none.
+    :return: the same with copies of dictionaries, and the strategy's current name.
+    :raises TypeError: if a dictionary of settings is not a dictionary.
     """
     kept = dict(settings)
     for group in GROUPS:
@@ -107,10 +107,10 @@ def tidied(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def refuse_old_names(names: Mapping[str, Any]) -> None:
-    """Refuse settings that were removed, or are part of others now.
+    """Refuse settings that were removed or moved into a dictionary.
 
     :param names: settings by name.
-    :raises TypeError: names them, and says what there is instead.
+    :raises TypeError: names them and their replacement.
     """
     removed = [f"{name} was removed: {REMOVED[name][1]}" for name in names if name in REMOVED]
     if removed:
@@ -123,11 +123,11 @@ def refuse_old_names(names: Mapping[str, Any]) -> None:
 
 
 def convert_older(agent: Any) -> None:
-    """Give an agent of an older file the settings that there are now.
+    """Convert an agent from an older file to the current settings.
 
-    :param agent: whose attributes have just been loaded. Removed ones with their defaults, which changed
-        nothing, are taken off.
-    :raises TypeError: if a removed one has another value than its default.
+    :param agent: whose attributes have just been loaded. Removed settings at their defaults, which had no
+        effect, are deleted.
+    :raises TypeError: if a removed setting is not at its default.
     """
     attributes = vars(agent)
     for name, (default, reason) in REMOVED.items():
@@ -139,16 +139,16 @@ def convert_older(agent: Any) -> None:
         attributes.pop(name, None)
     group_flat(attributes)
     for name, default in SETTINGS.items():
-        # An agent that was saved before a setting existed searches as if it had its default.
+        # An agent that was saved before a setting existed has its default.
         if not hasattr(agent, name):
             attributes[name] = default
 
 
 def group_flat(attributes: dict[str, Any]) -> None:
-    """Put settings that are part of others now where they belong.
+    """Move settings into the dictionaries that contain them now.
 
-    :param attributes: of an agent of an older file; changed. What was another strategy's or forward model's
-        changed nothing, and is left out.
+    :param attributes: of an agent from an older file; changed in place. Settings of other strategies or
+        forward models had no effect, and are dropped.
     """
     strategy = attributes.get("strategy")
     if isinstance(strategy, str) and strategy == "refine":
@@ -163,16 +163,16 @@ def group_flat(attributes: dict[str, Any]) -> None:
         if name in defaults and value != defaults[name]:
             found.setdefault(MOVED[name], {})[name] = value
     for group, values in found.items():
-        if attributes.get(group) is None:  # else it was given when loading
+        if attributes.get(group) is None:  # otherwise it was given when loading
             attributes[group] = values
 
 
 def settings_of_preset(name: str) -> dict[str, Any]:
-    """What an agent that was made with other settings, or a hyperparameter file, takes over from a preset.
+    """The settings that a preset replaces in an existing agent or a hyperparameter file.
 
     :param name: one of :data:`~sb3_mcbs.search.PRESETS`.
-    :return: every setting of how is searched; for ``"paper"``, which is Algorithm 1 at every step, also those
-        of when is searched, what is learned from simulations and whether searched actions get noise.
+    :return: all settings of the search; for ``"paper"``, Algorithm 1 at every step, also the schedule, value
+        expansion and ``action_noise_after_search``.
     :raises ValueError: if there is no such preset.
     """
     settings = make_settings(**with_preset(name, {})).grouped()
@@ -188,15 +188,15 @@ def settings_of_preset(name: str) -> dict[str, Any]:
 class SearchAttributes(RefusesOldNames):
     """:data:`~sb3_mcbs.agents.hyperparameters.SETTINGS` as attributes of an agent.
 
-    Once the agent is set up, they are checked when they are set, together with all others, and hold from the
-    next decision on::
+    Once the agent is set up, setting one checks it together with all others. It applies from the next
+    decision on::
 
         agent.beam_width = 20
         agent.search_kwargs = {"antithetic": True}
         agent.search_settings = TreeSettings(beam_width=4, branching=3)
         agent.preset = "balanced"
 
-    ``agent.search_kwargs["antithetic"] = True`` is noticed, and checked, at the next decision.
+    ``agent.search_kwargs["antithetic"] = True`` is detected and checked at the next decision.
     """
 
     beam_width: int
@@ -216,7 +216,7 @@ class SearchAttributes(RefusesOldNames):
     expanded_share: float
     action_noise_after_search: bool
     matmul_precision: str | None
-    #: What the dictionaries contained when they were last checked.
+    #: Contents of the dictionaries at the last check.
     _followed: list[dict[str, Any] | None]
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -234,7 +234,7 @@ class SearchAttributes(RefusesOldNames):
 
     @property
     def search_settings(self) -> SearchSettings:
-        """The settings of the search, checked. Another object changes them all at once."""
+        """The checked settings of the search. Assign an object to change them together."""
         return SearchSettings.of(self)
 
     @search_settings.setter
@@ -248,7 +248,7 @@ class SearchAttributes(RefusesOldNames):
 
     @property
     def schedule_settings(self) -> ScheduleSettings:
-        """The settings of the search's schedule, checked. Another object changes them all at once."""
+        """The checked settings of the schedule. Assign an object to change them together."""
         return ScheduleSettings.of(self)
 
     @schedule_settings.setter
@@ -258,11 +258,11 @@ class SearchAttributes(RefusesOldNames):
         self._change_settings(settings.grouped())
 
     def _change_settings(self, changes: dict[str, Any]) -> None:
-        """Change settings and have everything follow, or leave all as it was.
+        """Change settings and apply them, or restore all of them after an error.
 
         :param changes: new values by name.
         :raises TypeError: if a value has the wrong type.
-        :raises ValueError: if a value is out of range or does not go with the others.
+        :raises ValueError: if a value is out of range or does not fit the others.
         """
         attributes = vars(self)
         changes = tidied(changes)
@@ -278,27 +278,27 @@ class SearchAttributes(RefusesOldNames):
             raise
 
     def _note_dictionaries(self) -> None:
-        """Remember what the dictionaries contain, which was checked."""
+        """Remember the checked contents of the dictionaries."""
         vars(self)["_followed"] = deepcopy([getattr(self, group) for group in GROUPS])
         own = {"strategy": self.strategy, "search_kwargs": self.search_kwargs}
         if with_preset(self.preset, own)["search_kwargs"] != self.search_kwargs:
-            # An agent that is made with the same arguments would have what was taken from the preset.
+            # With the preset, an agent made with the same arguments would have keys that were removed here.
             vars(self)["preset"] = None
 
     def _follow_dictionaries(self) -> None:
-        """Follow what was changed within the dictionaries since they were last checked."""
+        """Apply changes inside the dictionaries since the last check."""
         if [getattr(self, group) for group in GROUPS] != self._followed:
             self._follow_settings()
 
     @property
     def _is_set_up(self) -> bool:
-        """Whether settings that change have to be followed."""
+        """Whether changed settings must be applied."""
         raise NotImplementedError
 
     def _follow_settings(self) -> None:
-        """Search with the present settings from the next decision on.
+        """Apply the current settings from the next decision on.
 
         :raises TypeError: if a value has the wrong type.
-        :raises ValueError: if a value is out of range or does not go with the others.
+        :raises ValueError: if a value is out of range or does not fit the others.
         """
         raise NotImplementedError

@@ -1,4 +1,4 @@
-"""The model that an agent learns of its environment while it trains."""
+"""A model of the environment that an agent learns while it trains."""
 
 from dataclasses import dataclass
 from typing import Any, Self
@@ -13,28 +13,28 @@ from sb3_mcbs.models.ensemble import Ensemble, Transitions, check_observation_sp
 from sb3_mcbs.search.checks import CheckedSettings, known_keys
 from sb3_mcbs.search.random_streams import spawn_rng
 
-#: One row of the replay buffer in so many is held out: always the last of them, so that a transition that was
-#: held out is never fitted later.
+#: Every tenth row of the replay buffer is held out, always the same ones, so that held-out transitions are
+#: never fitted later.
 HELD_OUT_EVERY = 10
-#: The model is fitted once there are so many transitions: fewer held-out ones would say nothing.
+#: Transitions before the first fit; with fewer, the held-out error is meaningless.
 LEAST_TRANSITIONS = 500
 
 
 @dataclass(frozen=True)
 class EnsembleSettings(CheckedSettings):
-    """What an agent learns a model of its environment with: in ``model_kwargs``, beside ``n_threads``, with
+    """Settings of the learned model: keys of ``model_kwargs``, besides ``n_threads``, with
     ``forward_model="ensemble"``.
 
-    :param ensemble_size: networks in the model.
+    :param ensemble_size: number of networks.
     :param ensemble_train_freq: environment steps between two fits of the model.
-    :param ensemble_gradient_steps: most gradient steps of a fit.
-    :param ensemble_max_error: the agent searches once the model's held-out error is at most this, and acts as
-        it does without search until then and whenever the error is higher again. The error is the mean
-        absolute error of one step of held-out transitions as a part of the mean absolute deviation of what is
-        predicted, averaged over the entries of the observation and the reward: 0 is perfect, 1 as bad as
-        always predicting the mean change of observations and the mean reward.
-    :param ensemble_pessimism: how much the disagreement of the networks lowers a predicted reward: this times
-        the disagreement (1: as much as what is predicted varies) times the standard deviation of rewards.
+    :param ensemble_gradient_steps: maximum gradient steps of a fit.
+    :param ensemble_max_error: the agent searches while the model's held-out error is at most this, and acts
+        without search otherwise. The error is the mean absolute error of one step on held-out transitions
+        divided by the mean absolute deviation of the target, averaged over the entries of the observation and
+        the reward: 0 is perfect, 1 is as bad as always predicting the mean change of observations and the
+        mean reward.
+    :param ensemble_pessimism: subtracts this times the networks' disagreement (relative to the target's
+        variation) times the standard deviation of rewards from predicted rewards.
     :raises TypeError: if a value has the wrong type.
     :raises ValueError: if a value is out of range.
     """
@@ -48,7 +48,7 @@ class EnsembleSettings(CheckedSettings):
     ensemble_pessimism: float = 1.0
 
     def __post_init__(self) -> None:
-        # One network has nobody to disagree with.
+        # A single network has no disagreement.
         self._set_integer("ensemble_size", 2, 100)
         self._set_integer("ensemble_train_freq", 1, 10**9)
         self._set_integer("ensemble_gradient_steps", 1, 10**6)
@@ -57,7 +57,7 @@ class EnsembleSettings(CheckedSettings):
 
     @classmethod
     def of(cls, agent: Any) -> Self:
-        """Read the settings that an agent carries in ``model_kwargs``.
+        """Read the settings from an agent's ``model_kwargs``.
 
         :param agent: an :class:`~sb3_mcbs.MCBS` agent.
         :return: the checked settings; the defaults without a learned model.
@@ -73,15 +73,14 @@ class EnsembleSettings(CheckedSettings):
 
 
 class LearnedModel:
-    """An ensemble, and what its training needs besides: part of an agent's state.
+    """An ensemble and the state of its training: part of an agent's state.
 
     :param agent: the agent, with a replay buffer.
-    :param settings: of the model.
+    :param settings: settings of the model.
 
-    :ivar ensemble: the ensemble.
-    :ivar rng: draws its first weights and its batches, and nothing else does.
+    :ivar ensemble: the networks.
+    :ivar rng: draws initial weights and batches, separately from the agent's generators.
     :raises ForwardModelError: if the agent's observations are not vectors of numbers.
-    :raises ValueError: if the replay buffer does not keep what is needed.
     """
 
     def __init__(self, agent: OffPolicyAlgorithm, settings: EnsembleSettings) -> None:
@@ -94,17 +93,17 @@ class LearnedModel:
         self._fitted_at: int | None = None
 
     def check(self, agent: OffPolicyAlgorithm, settings: EnsembleSettings) -> None:
-        """Refuse an agent that the model cannot learn from, and go to its device.
+        """Refuse an agent that the model cannot learn from, and move to its device.
 
         :param agent: the agent, set up.
-        :param settings: of the model.
-        :raises ValueError: says what does not fit.
+        :param settings: settings of the model.
+        :raises ValueError: names the reason.
         """
         size = self.ensemble.shape[0]
         if settings.ensemble_size != size:
             raise ValueError(
                 f"ensemble_size is {settings.ensemble_size}, and this agent has learned a model of {size} "
-                "networks: leave it as it was."
+                "networks: do not change it."
             )
         if getattr(agent.replay_buffer, "optimize_memory_usage", False):
             raise ValueError(
@@ -115,10 +114,10 @@ class LearnedModel:
 
     @staticmethod
     def check_room(buffer: ReplayBuffer) -> None:
-        """Refuse to train with a replay buffer that never holds enough to fit a model.
+        """Refuse to train with a replay buffer that is too small to fit a model.
 
-        :param buffer: the replay buffer. One for acting only may be smaller.
-        :raises ValueError: if it does not.
+        :param buffer: the replay buffer.
+        :raises ValueError: if it is too small.
         """
         room = buffer.buffer_size * buffer.n_envs
         if room < LEAST_TRANSITIONS:
@@ -131,10 +130,10 @@ class LearnedModel:
         """Fit the ensemble to the replay buffer if ``ensemble_train_freq`` steps have passed.
 
         :param agent: the agent; the errors are written to its logger.
-        :param settings: of the model.
+        :param settings: settings of the model.
         """
         now, then = agent.num_timesteps, self._fitted_at
-        # The count of steps starts again with every learn() that resets it.
+        # learn() may reset the number of steps.
         if then is None or not 0 <= now - then < settings.ensemble_train_freq:
             assert agent.replay_buffer is not None
             transitions, held_out = read_transitions(agent.replay_buffer)
@@ -149,11 +148,11 @@ class LearnedModel:
 
 
 def set_up_learned_model(agent: Any) -> None:
-    """Give an agent the model that its settings ask for, or take away one that they do not.
+    """Create the learned model if an agent's settings need one, or remove it.
 
     :param agent: an :class:`~sb3_mcbs.MCBS` agent with a replay buffer.
     :raises ForwardModelError: if its observations are not vectors of numbers.
-    :raises ValueError: if a setting is wrong, or does not fit.
+    :raises ValueError: if a setting is invalid.
     """
     settings = EnsembleSettings.of(agent)
     if agent.forward_model != "ensemble":
@@ -165,10 +164,10 @@ def set_up_learned_model(agent: Any) -> None:
 
 
 def check_learned_model(agent: Any) -> None:
-    """Refuse changed settings that are for another learned model than the agent has.
+    """Refuse changed settings that do not fit the agent's learned model.
 
     :param agent: an :class:`~sb3_mcbs.MCBS` agent that was set up.
-    :raises ValueError: if a setting is wrong, or does not fit.
+    :raises ValueError: if a setting is invalid.
     """
     if (agent.forward_model == "ensemble") != (agent.learned_model is not None):
         raise ValueError(
@@ -181,9 +180,9 @@ def check_learned_model(agent: Any) -> None:
 
 
 def read_transitions(buffer: ReplayBuffer) -> tuple[Transitions, np.ndarray]:
-    """What a replay buffer holds, without drawing from it, which would change what the agent draws.
+    """Read all transitions of a replay buffer without sampling, which would affect the agent's samples.
 
-    :param buffer: with single steps and observations that are a Box.
+    :param buffer: a buffer of single steps and Box observations.
     :return: the transitions ``[n]`` of all rows and environments, and which of them are held out.
     """
     stored: Any = buffer
@@ -192,7 +191,7 @@ def read_transitions(buffer: ReplayBuffer) -> tuple[Transitions, np.ndarray]:
     def flat(array: np.ndarray) -> np.ndarray:
         return array[:n_rows].reshape(n_rows * stored.n_envs, -1)
 
-    # A time limit ends an episode and is no termination.
+    # A time limit is not a termination.
     terminated = flat(stored.dones) * (1 - flat(stored.timeouts))
     transitions = Transitions(
         flat(stored.observations),

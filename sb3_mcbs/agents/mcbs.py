@@ -1,4 +1,4 @@
-"""What makes an off-policy agent look ahead before it acts, whatever it learns by."""
+"""The mixin that makes an off-policy agent look ahead before it acts."""
 
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -47,7 +47,7 @@ SelfMCBS = TypeVar("SelfMCBS", bound="MCBS")
 
 class MCBS(SearchAttributes, Searching, Resumable, Expanding):
     """
-    Monte Carlo Beam Search for an off-policy agent of SB3: the mixin that stands before it.
+    Monte Carlo Beam Search for an off-policy agent of SB3: a mixin that precedes SB3's class.
 
     ::
 
@@ -62,25 +62,25 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
     attributes, as SB3 does with its own.
     """
 
-    #: What neither ``save`` nor an exact checkpoint contains, and why.
+    #: Attributes that neither ``save`` nor exact checkpoints contain, and why.
     not_checkpointed: ClassVar[Collection[str]] = {
-        "planner": "its forward model simulates the environments as they are; what it remembers is saved",
-        "_prediction": "of the last step; made anew before it is read",
-        "_states": "of the last step; made anew before it is read",
+        "planner": "its forward model is made from the environments; its memory is saved",
+        "_prediction": "of the last step; computed again before it is read",
+        "_states": "of the last step; computed again before they are read",
         "_checked_env": "a view of the environment",
         "_followed": "copies of settings",
     }
-    #: Set by ``sb3_mcbs.checkpoints``, which knows the agents, and not the other way round.
+    #: Set by ``sb3_mcbs.checkpoints``, which imports the agents, not the other way round.
     _resume_as: ClassVar[Callable[..., Any]]
     _seed_at_setup: int | None = None
     _is_restored = False
 
     def _init_search(self, arguments: Mapping[str, Any]) -> None:
         """
-        Take over the constructor's arguments for the search.
+        Store the constructor's arguments for the search.
 
-        :param arguments: all of the constructor's, ``locals()``
-        :raises TypeError: if settings that should be a dictionary are none
+        :param arguments: all arguments of the constructor, ``locals()``
+        :raises TypeError: if a dictionary of settings is not a dictionary
         :raises ValueError: if there is no such preset
         """
         for name, value in complete_settings(arguments).items():
@@ -95,7 +95,7 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
         self.n_critic_evaluations = 0
         self.n_diverged_steps = 0
         self.planner: Planner | None = None
-        #: What the search predicted for the actions that are executed next.
+        #: The search's prediction for the next executed actions.
         self._prediction: Prediction | None = None
         self._states = None
         self.rollout_rng = None
@@ -116,7 +116,7 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
         convert_older(self)
         vars(self).update(tidied({name: value for name, value in vars(self).items() if name in SETTINGS}))
         settings, schedule = self._checked_settings()
-        # ``load`` seeds once more; generators that it has restored go on instead.
+        # ``load`` seeds once more; restored generators must keep their state.
         self._is_restored = self.search_rng is not None and self._seed_at_setup == self.seed
         super()._setup_model()
         del self._is_restored
@@ -161,7 +161,7 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
 
     def _make_planner(self, env: VecEnv, settings: SearchSettings) -> None:
         before, self._prediction, self._states = self.planner, None, None
-        # What this environment's VecNormalize does is what the critics learn from.
+        # The critics learn from the rewards of this environment's VecNormalize.
         normalizer = unwrap_vec_normalize(env)
         normalize_reward = normalizer is not None and normalizer.norm_reward
         self.planner = Planner(self, env, settings, normalize_reward, self.recent_actions)
@@ -181,13 +181,13 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
         assert self.env is not None
         try:
             self._make_planner(self.env, self.search_settings)
-        except Exception:  # the environment of before stays
+        except Exception:  # keep the previous environment
             vars(self).clear()
             vars(self).update(before)
             raise
 
     def __copy__(self: SelfMCBS) -> SelfMCBS:
-        # As with SB3's agents, networks and environments are those of the original. Settings are not.
+        # As with SB3's agents, networks and environments are shared with the original. Settings are not.
         made = type(self).__new__(type(self))
         vars(made).update(vars(self))
         for name in ("_schedule", "planner", *GROUPS):
@@ -216,8 +216,8 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
         n_envs: int = 1,
     ) -> tuple[np.ndarray, np.ndarray]:
         """
-        Search for the next actions, or sample them as the agent without search: before ``learning_starts``,
-        and in environments that the schedule leaves out.
+        Search for the next actions. Before ``learning_starts``, and in environments that the schedule leaves
+        out, sample them as the agent without search does.
 
         :param learning_starts: Number of steps before learning for the warm-up phase.
         :param action_noise: noise for actions that were not searched
@@ -229,9 +229,9 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
         self._prediction = None
         self._note_states()
         self._check_noise_after_search()
-        if self._noise_without_search is None:  # action_noise may have been taken away
+        if self._noise_without_search is None:  # action_noise may have been removed
             self._explore_where_not_searched()
-        # For all environments whatever is searched, so that random streams do not depend on the schedule.
+        # For all environments, searched or not, so that random streams do not depend on the schedule.
         drawn_from = self._noise_without_search if action_noise is None else action_noise
         noise = None if drawn_from is None else DrawnNoise(drawn_from)
         try:
@@ -260,7 +260,7 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
             self._prediction = Prediction.of(result, searched)
         if executed.all():
             return self.policy.unscale_action(found), found
-        # Of one kind, so that actions reach the environments as they are simulated.
+        # One dtype, so that the environments get the actions that were simulated.
         scaled_actions = scaled_actions.astype(found.dtype)
         scaled_actions[executed] = found
         return self.policy.unscale_action(scaled_actions), scaled_actions
@@ -280,8 +280,8 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
 
     @property
     def _progress(self) -> float:
-        """How much of the training is done, from 0 to 1."""
-        # A rollout of whole episodes, say, goes on beyond ``total_timesteps``.
+        """Progress of the training, from 0 to 1."""
+        # Rollouts of whole episodes, for example, may exceed ``total_timesteps``.
         return min(max(1.0 - self._current_progress_remaining, 0.0), 1.0)
 
     def _store_valid_transition(self, *transition: Any) -> None:
@@ -293,7 +293,7 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
         super()._store_valid_transition(*transition)
 
     def _verify(self, actions: np.ndarray, happened: EnvironmentStep) -> None:
-        """Compare what the forward model says of a step with what happened, and follow the environments."""
+        """Compare the forward model's prediction with what happened, and resync it after a difference."""
         assert self.planner is not None
         prediction = self._predict_step(actions) or self._prediction
         error = None if prediction is None else self.planner.verify(prediction, happened)
@@ -303,7 +303,7 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
                 self.planner.resync(error)
 
     def _raw_rewards(self, reward: np.ndarray) -> np.ndarray:
-        """Rewards as the environments gave them."""
+        """Rewards without normalisation."""
         normalizer = self._vec_normalize_env
         return reward if normalizer is None else normalizer.get_original_reward()
 
@@ -323,7 +323,7 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
             assert self.replay_buffer is not None
             self.learned_model.check_room(self.replay_buffer)
         result = super()._setup_learn(*args, **kwargs)
-        if self._total_timesteps:  # what is known of progress is that of the training before
+        if self._total_timesteps:  # the progress is still that of the previous training
             self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
         return result
 
@@ -344,8 +344,8 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
         """
         Update the networks as the agent without search does.
 
-        :param gradient_steps: how many gradient steps to do
-        :param batch_size: transitions sampled for each
+        :param gradient_steps: number of gradient steps
+        :param batch_size: transitions per gradient step
         """
         if self.learned_model is not None:
             self.learned_model.fit_if_due(self, EnsembleSettings.of(self))
@@ -389,8 +389,8 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
 
         :param path: path to the file, or a file-like object
         :param args: the other parameters of SB3's ``load``
-        :param kwargs: the same, and settings that replace those in the file; a ``preset`` replaces all of how
-            is searched, except for settings beside it
+        :param kwargs: the same, and settings that replace those in the file; a ``preset`` replaces all
+            settings of the search that are not given explicitly
         :return: the model
         """
         objects = kwargs.get("custom_objects") or {}
@@ -398,7 +398,7 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
         preset = kwargs.get("preset", objects.get("preset"))
         if preset is not None:
             kwargs = merged(settings_of_preset(preset), kwargs)
-        # An older file has what these contain as attributes, which None would leave.
+        # Older files have the keys of these as attributes, which None would leave in place.
         kwargs = {name: {} if name in GROUPS and value is None else value for name, value in kwargs.items()}
         return super().load(path, *args, **kwargs)
 
@@ -408,10 +408,10 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
         Continue a run from its exact checkpoints, see :func:`sb3_mcbs.resume`.
 
         :param path: the folder of checkpoints
-        :param env: the environment, made as the original one was; None makes it from its id
+        :param env: the environment, made like the original one; None makes it from its id
         :param kwargs: the other arguments of :func:`sb3_mcbs.resume`
         :return: the agent
-        :raises CheckpointError: if there is no whole checkpoint, or it is of another class
+        :raises CheckpointError: if there is no intact checkpoint, or it is of another class
         """
         return MCBS._resume_as(cls, path, env, **kwargs)
 
@@ -428,14 +428,14 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
         :param observation: the input observation
         :param state: not used
         :param episode_start: not used
-        :param deterministic: whether SAC and TQC take their mean action instead of a random one; the actors
-            of TD3 and DDPG are deterministic
+        :param deterministic: whether SAC and TQC take their mean action instead of a sample; the actors of
+            TD3 and DDPG are deterministic
         :return: the actor's action and ``state``
         """
         return super().predict(observation, state, episode_start, deterministic)
 
     def _excluded_save_params(self) -> list[str]:
-        # The noise is made anew by learn(), which an exact checkpoint is in the middle of.
+        # learn() makes the noise again; exact checkpoints, taken during learn(), need it.
         return [*super()._excluded_save_params(), *MCBS.not_checkpointed, "_noise_without_search"]
 
     def _search_memory(self) -> dict[str, Any]:
@@ -443,6 +443,6 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
         return self.planner.memory
 
     def _go_on_searching(self, memory: dict[str, Any]) -> None:
-        self._follow_settings()  # a callback may have changed them
+        self._follow_settings()  # callbacks may have changed them
         assert self.planner is not None
         self.planner.memory = memory

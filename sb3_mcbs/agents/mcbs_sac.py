@@ -17,50 +17,48 @@ class MCBSSAC(MCBS, SAC):
     """
     Monte Carlo Beam Search for SAC (MCBS-SAC).
 
-    As :class:`~sb3_mcbs.MCBSTD3`, with the losses of SAC: ``matmul_precision`` holds for them too.
-    Searched actions lie around the actor's mean action, not around one that the actor (or gSDE) drew, and
-    rollouts end with the minimum of the critics' values, without an entropy term. Before ``learning_starts``
-    the agent acts as SAC does.
+    Like :class:`~sb3_mcbs.MCBSTD3`, with the losses of SAC. Candidates are around the actor's mean action,
+    not around a sample of the actor (or gSDE), and rollouts bootstrap from the minimum of the critics,
+    without an entropy term. Before ``learning_starts`` the agent acts as SAC.
 
     ``predict`` is the actor alone, without search, as for every SB3 algorithm: it needs no environment.
     To act with search use :class:`~sb3_mcbs.SearchPolicy`.
 
-    What is simulated needs environments in :class:`~sb3_mcbs.SnapshotEnvWrapper`: the algorithm wraps them
-    itself, except in a ``SubprocVecEnv``, where they must be wrapped when they are made.
+    Simulation needs environments in :class:`~sb3_mcbs.SnapshotEnvWrapper`. The algorithm wraps them itself,
+    except in a ``SubprocVecEnv``, where they must be wrapped when they are made.
 
-    The parameters before ``beam_width`` are those of :class:`~stable_baselines3.SAC`. What there is to
-    say of them here:
+    The parameters before ``beam_width`` are those of :class:`~stable_baselines3.SAC`. Those that the
+    search affects, and its own:
 
-    :param learning_starts: how many steps of the model to collect transitions for before learning, and
-        searching, starts
-    :param gamma: the discount factor, of the critics and of the rollouts
-    :param action_noise: noise on actions chosen without search (before ``learning_starts`` and where
-        the schedule leaves the search out). Searched actions are executed as they are unless
-        ``action_noise_after_search`` is set.
+    :param learning_starts: how many steps of the model to collect transitions for before learning and
+        searching start
+    :param gamma: the discount factor of the critics and of the rollouts
+    :param action_noise: noise on actions chosen without search (before ``learning_starts`` and where the
+        schedule leaves the search out), and on searched ones if ``action_noise_after_search`` is set
     :param use_sde: Whether to use generalized State Dependent Exploration (gSDE), for actions chosen without
         search and for the losses
-    :param seed: Seed for the pseudo random generators, the search's own included
-    :param device: Device (cpu, cuda, ...) on which the networks run; simulation is on the CPU
+    :param seed: Seed for the pseudo random generators, including the search's own
+    :param device: Device (cpu, cuda, ...) of the networks; simulation runs on the CPU
     :param beam_width: number of candidate actions per decision (None: the preset's, or 6)
     :param rollout_depth: simulated steps per rollout; 0 ranks by the critics alone (None: the preset's, or 3)
     :param n_simulations: rollouts per candidate (None: the preset's, or 5)
-    :param beam_noise: spread of the candidates, in scaled actions (None: the preset's, or 0.1)
+    :param beam_noise: standard deviation of candidates, in scaled actions (None: the preset's, or 0.1)
     :param strategy: ``"beam"``, ``"tree"`` or ``"cem"`` (None: the preset's, or ``"beam"``)
     :param search_kwargs: additional settings of the strategy, see :class:`~sb3_mcbs.BeamSettings`,
         :class:`~sb3_mcbs.TreeSettings` and :class:`~sb3_mcbs.CEMSettings`
-    :param preset: a name of :data:`~sb3_mcbs.search.PRESETS`: where the settings of the search start from
+    :param preset: one of :data:`~sb3_mcbs.search.PRESETS`, from which the settings of the search start
     :param search_schedule: when to search: ``"constant"``, ``"saturation"`` or ``"anneal"``
     :param search_share: the share of decisions that are searched
-    :param search_unit: whether that is drawn for every ``"step"`` or every ``"episode"``
+    :param search_unit: whether search is drawn for every ``"step"`` or every ``"episode"``
     :param schedule_kwargs: additional settings of the schedule, see
         :class:`~sb3_mcbs.agents.ScheduleSettings`
-    :param forward_model: what simulates: ``"auto"``, ``"mujoco"``, ``"pool"`` or ``"ensemble"`` (learned)
-    :param model_kwargs: additional settings of that: ``n_threads``, and for ``"ensemble"`` those of
-        :class:`~sb3_mcbs.agents.EnsembleSettings`
-    :param value_expansion: simulated steps before the critics' targets close (0: none, as SB3)
-    :param expanded_share: the share of every batch that this is done for
+    :param forward_model: the simulator: ``"auto"``, ``"mujoco"``, ``"pool"`` or ``"ensemble"`` (learned)
+    :param model_kwargs: additional settings of the forward model: ``n_threads``, and for ``"ensemble"`` those
+        of :class:`~sb3_mcbs.agents.EnsembleSettings`
+    :param value_expansion: simulated steps before critic targets bootstrap (0: none, as in SB3)
+    :param expanded_share: the share of every batch that is expanded
     :param action_noise_after_search: add ``action_noise`` to searched actions too
-    :param matmul_precision: of the networks' float32 products (None: as the process has it)
+    :param matmul_precision: precision of the networks' float32 products (None: the process's setting)
     """
 
     def __init__(

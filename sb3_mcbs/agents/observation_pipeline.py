@@ -1,8 +1,7 @@
-"""What the layers of a vectorized environment do to observations and rewards.
+"""Applies the wrappers of a vectorized environment to simulated observations and rewards.
 
-A forward model simulates the environments themselves. The networks see observations through the
-``VecEnv`` wrappers around them, so a search has to apply the same wrappers to simulated observations,
-without changing their statistics.
+A forward model simulates the environments themselves, while the networks see observations through the
+``VecEnv`` wrappers around them. A search applies the same wrappers without changing their statistics.
 """
 
 import warnings
@@ -34,9 +33,9 @@ _PURE = (VecNormalize, VecTransposeImage, VecExtractDictObs)
 
 
 class ObservationPipeline:
-    """Observations and rewards as an agent's replay buffer keeps them, and as its networks see them.
+    """Converts observations and rewards from the replay buffer's form to that of the networks.
 
-    Only ``VecNormalize`` is between the two, whatever other wrappers there are.
+    Only ``VecNormalize`` lies between the two, whatever other wrappers there are.
 
     :param vec_env: the environment that the agent acts in.
     :param reward_normalizer: the ``VecNormalize`` whose reward scale the critics learned, if any.
@@ -51,19 +50,19 @@ class ObservationPipeline:
     def observe(self, observations: Observations, normalize: bool = True) -> Observations:
         """Turn observations of the replay buffer into those of the networks.
 
-        :param observations: ``[rows, *obs_shape]`` as replay buffers keep them.
-        :param normalize: False leaves them as they are.
+        :param observations: ``[rows, *obs_shape]`` as stored in replay buffers.
+        :param normalize: False leaves them unchanged.
         :return: ``[rows, *]`` as the networks expect them.
         """
         normalizer = unwrap_vec_normalize(self.vec_env)
         return observations if normalizer is None or not normalize else normalizer.normalize_obs(observations)
 
     def original(self, observations: Observations) -> Observations:
-        """The last observations of all environments as replay buffers keep them.
+        """The last observations of all environments as stored in replay buffers.
 
-        :param observations: the same as the agent was given them.
+        :param observations: the same as the agent got them.
         :return: ``[n_envs, *obs_shape]``.
-        :raises ValueError: if the environment did not give these observations last.
+        :raises ValueError: if these are not the environment's last observations.
         """
         normalizer = unwrap_vec_normalize(self.vec_env)
         if normalizer is None:
@@ -77,7 +76,7 @@ class ObservationPipeline:
         return original
 
     def unnormalize(self, observation: np.ndarray) -> np.ndarray:
-        """Undo what ``VecNormalize`` did to the last observation of an episode, as SB3 does.
+        """Undo the normalisation of an episode's last observation, as SB3 does.
 
         :param observation: ``[*obs_shape]``.
         """
@@ -85,7 +84,7 @@ class ObservationPipeline:
         return observation if normalizer is None else normalizer.unnormalize_obs(observation)  # type: ignore[return-value]
 
     def scale_reward(self, rewards: np.ndarray) -> np.ndarray:
-        """Bring rewards to the scale on which the critics were trained.
+        """Scale rewards as in the critics' training.
 
         :param rewards: ``[rows]`` as the environments return them.
         :return: ``[rows]``.
@@ -98,11 +97,11 @@ class ObservationPipeline:
 
 
 class EnvironmentPipeline(ObservationPipeline):
-    """The same from the environments' own observations on, which other wrappers may alter too.
+    """Converts the environments' own observations, which other wrappers may alter too.
 
     :param vec_env: the environment that the agent acts in.
     :param reward_normalizer: the ``VecNormalize`` whose reward scale the critics learned, if any.
-    :raises ValueError: if a wrapper may alter observations or actions in a way that is not known.
+    :raises ValueError: if an unknown wrapper may alter observations or actions.
     """
 
     def __init__(self, vec_env: VecEnv, reward_normalizer: VecNormalize | None) -> None:
@@ -123,10 +122,10 @@ class EnvironmentPipeline(ObservationPipeline):
         self.base: VecEnv = vec_env
 
     def buffered_observation(self, index: int) -> Any:
-        """What an environment of this process returned last, also if it was wrapped after that.
+        """The last observation of an environment in this process, even if it was wrapped later.
 
-        :param index: which environment.
-        :return: its observation, or ``None`` for environments of other processes.
+        :param index: the environment's index.
+        :return: its observation, or ``None`` for environments in other processes.
         """
         if not isinstance(self.base, DummyVecEnv):
             return None
@@ -137,10 +136,10 @@ class EnvironmentPipeline(ObservationPipeline):
         """Pass observations of the environments through the wrappers.
 
         :param observations: ``[rows, *obs_shape]`` as the environments return them.
-        :param normalize: False leaves ``VecNormalize`` out, as replay buffers keep them.
+        :param normalize: False leaves ``VecNormalize`` out, as in replay buffers.
         :return: ``[rows, *]`` as the networks expect them.
         """
-        if isinstance(self.base, DummyVecEnv):  # it copies them into arrays of its own; workers send them
+        if isinstance(self.base, DummyVecEnv):  # it copies them into its own arrays; workers send them
             observations = _as_space_dtype(observations, self.base.observation_space)
         return self._through_layers(observations, normalize)
 
@@ -148,7 +147,7 @@ class EnvironmentPipeline(ObservationPipeline):
         """Pass the last observations of episodes through the wrappers, as ``infos`` have them.
 
         :param observations: ``[rows, *obs_shape]`` as the environments return them.
-        :return: ``[rows, *]`` as replay buffers keep them.
+        :return: ``[rows, *]`` as stored in replay buffers.
         """
         return self.as_kept(self._through_layers(observations, normalize=True))
 
@@ -176,11 +175,11 @@ def reward_normalizer(
 ) -> VecNormalize | None:
     """Find the reward scale that the critics learned.
 
-    :param training_env: the environment that the agent was trained in, if it is at hand.
-    :param vec_env: the environment that it acts in; for evaluation ``norm_reward`` is usually off there
-        although its statistics hold the scale.
-    :param normalize_reward: whether the critics learned from normalised rewards. ``None``: as
-        ``training_env`` says; if that is not at hand but ``vec_env`` has statistics, they are used.
+    :param training_env: the environment that the agent was trained in, if available.
+    :param vec_env: the environment that it acts in; for evaluation its ``norm_reward`` is usually off,
+        although its statistics contain the scale.
+    :param normalize_reward: whether the critics learned from normalised rewards. ``None``: inferred from
+        ``training_env``, or else from the statistics of ``vec_env``.
     :return: the layer whose ``ret_rms`` is the scale, or ``None`` if rewards were not normalised.
     :raises ValueError: if rewards were normalised but no statistics can be found.
     """
@@ -211,13 +210,13 @@ def reward_normalizer(
 
 
 def snapshot_environments(vec_env: VecEnv) -> Environments:
-    """Reach the environments inside a vectorized one, wrapping them if that is possible.
+    """Access the environments inside a vectorized one, and wrap them if possible.
 
     Environments in this process are wrapped in place; those of a ``SubprocVecEnv`` cannot be wrapped
     afterwards.
 
     :param vec_env: the innermost vectorized environment.
-    :return: access to the environments where they live.
+    :return: access to the environments in their processes.
     :raises ValueError: if the environments of worker processes are not wrapped outermost.
     :raises TypeError: if the vectorized environment is of another kind.
     """

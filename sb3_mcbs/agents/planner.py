@@ -1,4 +1,4 @@
-"""Joins an agent's networks, the environments it acts in and a forward model to a search."""
+"""Combines an agent's networks, its environments and a forward model into a search."""
 
 import os
 import time
@@ -38,22 +38,22 @@ from sb3_mcbs.types import ForwardModel, Observations, n_rows, take_rows
 
 
 class Planner:
-    """Searches for an agent from the present states of the environments that it acts in.
+    """Searches for an agent's actions from the current states of its environments.
 
-    :meth:`plan` decides, :meth:`verify` compares what the search predicted with what happened then, and
-    :meth:`resync` follows environments that turn out to be others than the forward model.
+    :meth:`plan` chooses actions, :meth:`verify` compares the search's prediction with what happened, and
+    :meth:`resync` updates the forward model if they differ.
 
-    A copy makes its forward model when it needs it first: while an object is unpickled, the others that it
-    knows are not complete, and ``VecNormalize`` never has its environments then.
+    A copy makes its forward model at its first use: during unpickling, related objects are incomplete, and
+    ``VecNormalize`` has no environments.
 
     :param agent: a TD3, DDPG, SAC or TQC agent.
     :param vec_env: the environments; those in this process are wrapped in place.
     :param settings: settings of the search.
     :param normalize_reward: see :class:`~sb3_mcbs.SearchPolicy`.
-    :param recent_actions: what the agent executed, for ``proposal_dims``; ``None``: nothing yet.
+    :param recent_actions: the agent's executed actions, for ``proposal_dims``; ``None``: none yet.
     :raises SnapshotUnsupportedError: if an environment's state cannot be captured.
     :raises ForwardModelError: if the requested forward model cannot simulate the environments.
-    :raises ValueError: if the settings make no sense with the agent, its actions or the environments' random
+    :raises ValueError: if the settings do not fit the agent, its actions or the environments' random
         dynamics.
     """
 
@@ -73,11 +73,11 @@ class Planner:
         self._all_envs = range(vec_env.num_envs)
         self.recent_actions = RecentActions(self._act_dim) if recent_actions is None else recent_actions
         self._invalid_decisions = InvalidDecisions()
-        #: Rounds of other sizes take other times.
+        #: One per number of environments and depth, since rounds take longer with more.
         self._forecasts: defaultdict[tuple[int, int], LatencyForecast] = defaultdict(LatencyForecast)
         self._check(settings)
         self._source = self._make_source(settings)
-        #: What a source that is not made yet has to know.
+        #: The memory of a source that is not made yet.
         self._remembered: dict[str, Any] | None = None
         if self._source is not None:
             check_dynamics(settings, self._source.model.deterministic)
@@ -105,7 +105,7 @@ class Planner:
 
     @property
     def description(self) -> str:
-        """One line that says what simulates."""
+        """One line that names the forward model."""
         return "none: the critics rank the candidates" if self.model is None else self.model.description
 
     def plan(
@@ -117,14 +117,13 @@ class Planner:
     ) -> SearchResult:
         """Choose an action for every environment, or for some.
 
-        :param observations: ``[n_envs, *]``, the environments' present observations as the agent got them.
-        :param rng: the search's own generator.
-        :param envs: which environments, rising; nothing is read of the others, or simulated for them.
-            ``None``: all.
-        :param settings: the settings with another width or depth, if they are not to be those of always.
-        :return: actions, and what the search found, a row for each of ``envs``.
-        :raises ValueError: if the observations are not those of the environments' present states.
-        :raises NonFiniteError: if the networks, or the observations, are not finite.
+        :param observations: ``[n_envs, *]``, the environments' current observations as the agent got them.
+        :param rng: draws the noise, and is given to a model with random dynamics.
+        :param envs: indices of environments, ascending; the others are not read or simulated. ``None``: all.
+        :param settings: settings of this decision, with another width or depth. ``None``: :attr:`settings`.
+        :return: actions and details of the search, a row for each of ``envs``.
+        :raises ValueError: if the observations are not those of the environments' current states.
+        :raises NonFiniteError: if the networks' outputs, or the observations, are not finite.
         """
         start = time.perf_counter()
         self.go_on_here()
@@ -151,24 +150,24 @@ class Planner:
         return result
 
     def capture_roots(self, observations: Observations, envs: Sequence[int]) -> Roots:
-        """Read where rollouts start.
+        """Read the states where rollouts start.
 
-        :param observations: ``[n_envs, *]``, of all environments as the agent was given them.
-        :param envs: which environments, rising.
-        :raises ValueError: if the observations are not those of the environments' present states.
+        :param observations: ``[n_envs, *]``, of all environments as the agent got them.
+        :param envs: indices of environments, ascending.
+        :raises ValueError: if the observations are not those of the environments' current states.
         """
         if self.source is None:
             return Roots(None, [], take_rows(observations, np.asarray(envs)))
         return self.source.capture_roots(observations, envs)
 
     def read_states(self) -> list[Any]:
-        """Read the present states of all environments.
+        """Read the current states of all environments.
 
-        :raises ForwardModelError: if no simulator goes on from states of environments.
+        :raises ForwardModelError: if the forward model does not simulate from states of environments.
         """
         if not isinstance(self.source, ExactRoots):
             raise ForwardModelError(
-                f"no states of environments can be read; here simulates: {self.description}"
+                f"States of environments cannot be read; the forward model is: {self.description}"
             )
         return self.source.read_states(self._all_envs)
 
@@ -178,8 +177,8 @@ class Planner:
         :param states: from :meth:`read_states`.
         :param actions: ``[n_envs, act_dim]``, scaled.
         :param rng: given to a model with random dynamics.
-        :return: what they will do, where the simulation does not diverge; ``None`` if they are not
-            deterministic.
+        :return: the predicted step of environments whose simulation does not diverge; ``None`` without a
+            deterministic forward model.
         """
         model = self.model
         if model is None or not model.deterministic:
@@ -192,35 +191,35 @@ class Planner:
         return Prediction(valid.tolist(), actions[valid], first_step)
 
     def verify(self, prediction: Prediction, happened: EnvironmentStep) -> float | None:
-        """Compare what was predicted for the executed actions with what happened.
+        """Compare the prediction for the executed actions with what happened.
 
-        In a deterministic environment a difference means that it was edited, or that it is not deterministic
-        after all: :meth:`resync` follows it.
+        In a deterministic environment a difference means that it was edited, or that it is not deterministic;
+        then call :meth:`resync`.
 
-        :param prediction: of the executed actions.
-        :param happened: what the environments did.
-        :return: the largest absolute difference in observations (as the networks see them) and rewards, or of
-            a learned model its error; ``None`` if the forward model does not claim to be deterministic.
+        :param prediction: for the executed actions.
+        :param happened: the environments' step.
+        :return: the largest absolute difference in observations (as the networks see them) and rewards, or a
+            learned model's error; ``None`` if the forward model does not claim to be deterministic.
         """
         return None if self.source is None else self.source.error(prediction, happened)
 
     def resync(self, error: float) -> None:
-        """Make the forward model what the environments are now; a learned one learns that by itself.
+        """Update the forward model to the environments; a learned one adapts by itself.
 
         :param error: from :meth:`verify`.
-        :raises ForwardModelError: if the forward model that was asked for cannot follow.
-        :raises ValueError: if the settings make no sense with random dynamics.
+        :raises ForwardModelError: if the requested forward model cannot simulate the changed environments.
+        :raises ValueError: if the settings do not fit random dynamics.
         """
         if self.source is not None:
             self.source.resync(error)
 
     def follow(self, settings: SearchSettings) -> bool:
-        """Search with other settings from the next decision on.
+        """Use other settings from the next decision on.
 
-        :param settings: the settings.
-        :return: whether another forward model simulates from now on.
-        :raises ValueError: if they make no sense with the agent, its actions or the environments' dynamics.
-            Nothing has changed then.
+        :param settings: the new settings.
+        :return: whether the forward model was replaced.
+        :raises ValueError: if they do not fit the agent, its actions or the environments' dynamics. Nothing
+            has changed then.
         """
         if settings == self.settings:
             return False
@@ -246,7 +245,7 @@ class Planner:
         return exchanged
 
     def normalize_rewards(self, normalize: bool) -> None:
-        """Follow a ``VecNormalize`` whose ``norm_reward`` was switched.
+        """Adapt to a ``VecNormalize`` whose ``norm_reward`` was changed.
 
         :param normalize: whether the critics learn from normalised rewards.
         """
@@ -257,15 +256,15 @@ class Planner:
             )
 
     def check_networks(self, observations: Observations) -> None:
-        """Find out whether the networks have diverged.
+        """Check whether the networks have diverged.
 
         :param observations: ``[n_envs, *]``, as the agent got them.
-        :raises NonFiniteError: if it is the networks, or the observations, that are not finite.
+        :raises NonFiniteError: if the networks' outputs, or the observations, are not finite.
         """
         check_networks(policy_function(self.agent), value_function(self.agent), observations)
 
     def remember_actions(self, actions: np.ndarray) -> None:
-        """Remember what is executed, if the search learns directions from it.
+        """Remember executed actions, if the search learns directions from them.
 
         :param actions: ``[n, *]``, scaled.
         """
@@ -274,7 +273,7 @@ class Planner:
 
     @property
     def memory(self) -> dict[str, Any]:
-        """What was noticed about the environments, as plain values: part of exact checkpoints."""
+        """What the planner has learned about the environments, as plain values: part of exact checkpoints."""
         source = self.source
         noticed = {"kind": None, "deterministic": None, "previous_step_differed": False}
         return {
@@ -294,7 +293,7 @@ class Planner:
         self.source.memory = memory
 
     def functions(self) -> PolicyFunctions:
-        """The agent as it is now, as a search knows it: functions of what the forward model simulates."""
+        """The agent's current networks as functions of simulated observations."""
         policy, gamma = policy_function(self.agent), self.agent.gamma
         value, unscale = value_function(self.agent), unscale_function(self.agent)
         if self.source is None:
@@ -323,7 +322,7 @@ class Planner:
             self._source.model.close()
 
     def go_on_here(self) -> None:
-        """Notice a fork of the process since this object was made."""
+        """Detect a fork of the process since this object was made."""
         self._process = go_on_in_process(self._process)
 
     def _check(self, settings: SearchSettings) -> None:
@@ -337,7 +336,7 @@ class Planner:
         if settings.rollout_depth == 0:
             return None
         normalizer = reward_normalizer(self.agent.get_env(), self._vec_env, self.normalize_reward)
-        # What this was found out from may have changed when a copy makes its own.
+        # A copy makes its source later, when the environments may have changed.
         self.normalize_reward = normalizer is not None
         if settings.forward_model == "ensemble":
             return LearnedRoots(self.agent, self._vec_env, settings, normalizer)
@@ -377,5 +376,5 @@ class Planner:
 
 
 def _forward_model_settings(settings: SearchSettings) -> tuple[Any, ...]:
-    """What the forward model is made with."""
+    """The settings that determine the forward model."""
     return settings.forward_model, settings.n_threads, settings.rollout_depth > 0

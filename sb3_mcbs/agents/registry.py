@@ -1,4 +1,4 @@
-"""The algorithms by the names that they have on RL Zoo's command line."""
+"""The algorithms by their names on RL Zoo's command line."""
 
 from sb3_contrib import TQC
 from stable_baselines3 import DDPG, SAC, TD3
@@ -10,9 +10,9 @@ from sb3_mcbs.agents.mcbs_sac import MCBSSAC
 from sb3_mcbs.agents.mcbs_td3 import MCBSTD3
 from sb3_mcbs.agents.mcbs_tqc import MCBSTQC
 
-#: Without search: the baselines, and what a search can be put on once it is trained.
+#: Without search: the baselines, and agents for :class:`~sb3_mcbs.SearchPolicy`.
 BASELINES: dict[str, type[OffPolicyAlgorithm]] = {"td3": TD3, "ddpg": DDPG, "sac": SAC, "tqc": TQC}
-#: Those that search while they train.
+#: Algorithms that search while they train.
 SEARCHING: dict[str, type[MCBS]] = {
     "mcbs_td3": MCBSTD3,
     "mcbs_ddpg": MCBSDDPG,

@@ -1,4 +1,4 @@
-"""What exact checkpoints need of an agent. They know the agents, and not the other way round."""
+"""What exact checkpoints need from an agent. They import the agents, not the other way round."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection
@@ -9,7 +9,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 
 class StoppedRun(Protocol):
-    """A run that was stopped, and that the next ``learn`` of an agent finishes."""
+    """A stopped run, which the agent's next call of ``learn`` finishes."""
 
     def check_call(self, agent: Any, callback: BaseCallback) -> None:
         """Refuse a call of ``learn`` that would not finish the run.
@@ -20,13 +20,13 @@ class StoppedRun(Protocol):
 
 
 class Resumable(OffPolicyAlgorithm):
-    """An agent that can be given a stopped run. The checkpoint callback puts the run's state back.
+    """An agent that can continue a stopped run. The checkpoint callback restores the run's state.
 
-    Without that callback nobody would notice that the run starts from the beginning, so the agent itself has
-    the call of ``learn`` checked.
+    Without that callback the run would silently start from the beginning, so the agent checks the call of
+    ``learn``.
     """
 
-    not_checkpointed: ClassVar[Collection[str]] = {"_stopped_run": "only there until the run goes on"}
+    not_checkpointed: ClassVar[Collection[str]] = {"_stopped_run": "only set until the run continues"}
     _stopped_run: StoppedRun | None = None
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
@@ -40,15 +40,15 @@ class Resumable(OffPolicyAlgorithm):
 
 
 class Searching(ABC):
-    """Something that searches: its search remembers more than its attributes say."""
+    """An object whose search has a memory besides its attributes."""
 
     @abstractmethod
     def _search_memory(self) -> dict[str, Any]:
-        """Return what the search remembers."""
+        """Return the memory of the search."""
 
     @abstractmethod
     def _go_on_searching(self, memory: dict[str, Any]) -> None:
-        """Search on as another one did, once all attributes are put back.
+        """Restore the memory of the search, after all attributes are restored.
 
         :param memory: from :meth:`_search_memory`.
         """

@@ -1,4 +1,4 @@
-"""Where the rollouts of an agent start: the environments' states, or what a learned model knows of them."""
+"""Where rollouts start: the environments' states, or observations for a learned model."""
 
 import logging
 import warnings
@@ -26,11 +26,11 @@ logger = logging.getLogger("sb3_mcbs")
 
 
 class Prediction(NamedTuple):
-    """What a forward model said of the actions that were executed next.
+    """A forward model's prediction for the executed actions.
 
-    :param envs: the environments that it is about.
+    :param envs: indices of the environments.
     :param actions: ``[len(envs), act_dim]``, scaled.
-    :param step: ``[len(envs)]``, what they will do.
+    :param step: ``[len(envs)]``, the predicted step.
     """
 
     envs: Sequence[int]
@@ -39,10 +39,10 @@ class Prediction(NamedTuple):
 
     @classmethod
     def of(cls, result: SearchResult, envs: Sequence[int]) -> "Prediction | None":
-        """What a search predicts for the actions that it chose.
+        """The prediction of a search for its chosen actions.
 
-        :param result: of the search.
-        :param envs: the environments that were searched.
+        :param result: the search's result.
+        :param envs: indices of the searched environments.
         :return: ``None`` if nothing was simulated.
         """
         if result.first_step is None:
@@ -53,11 +53,11 @@ class Prediction(NamedTuple):
 
 
 class EnvironmentStep(NamedTuple):
-    """What the environments did.
+    """One real step of the environments.
 
-    :param observations: ``[n_envs, *]``, what the agent received next.
-    :param rewards: ``[n_envs]``, of the environments, not normalised.
-    :param infos: one per environment; where an episode ended the last observation is in it.
+    :param observations: ``[n_envs, *]``, the agent's next observations.
+    :param rewards: ``[n_envs]``, not normalised.
+    :param infos: one per environment; it contains the last observation where an episode ended.
     """
 
     observations: Observations
@@ -66,11 +66,11 @@ class EnvironmentStep(NamedTuple):
 
 
 class RootSource(ABC):
-    """Reads where rollouts start, and holds what simulates them.
+    """Reads where rollouts start, and holds the forward model.
 
     :ivar model: the forward model.
-    :ivar view: how the networks see what it simulates.
-    :ivar settings: of the search.
+    :ivar view: turns simulated observations and rewards into those of the networks.
+    :ivar settings: settings of the search.
     """
 
     model: ForwardModel
@@ -84,40 +84,40 @@ class RootSource(ABC):
 
     @abstractmethod
     def capture_roots(self, observations: Observations, envs: Sequence[int]) -> Roots:
-        """Read the environments' present states.
+        """Read the environments' current states.
 
-        :param observations: ``[n_envs, *]``, of all environments as the agent was given them.
-        :param envs: which environments, rising.
-        :raises ValueError: if the observations are not those of the present states.
+        :param observations: ``[n_envs, *]``, of all environments as the agent got them.
+        :param envs: indices of environments, ascending.
+        :raises ValueError: if the observations are not those of the current states.
         """
 
     @abstractmethod
     def episode_clocks(self, envs: Sequence[int]) -> list[EpisodeClock]:
-        """Read the present moments of environments.
+        """Read the episode clocks of environments.
 
-        :param envs: which environments.
+        :param envs: indices of environments.
         """
 
     @abstractmethod
     def error(self, prediction: Prediction, happened: EnvironmentStep) -> float | None:
         """Compare a prediction with what happened.
 
-        :param prediction: of the executed actions.
-        :param happened: what the environments did.
-        :return: the error; ``None`` if the forward model makes no claim about it.
+        :param prediction: for the executed actions.
+        :param happened: the environments' step.
+        :return: the error; ``None`` if the forward model is not deterministic.
         """
 
     def resync(self, error: float) -> None:  # noqa: B027
-        """Make the forward model what the environments are now.
+        """Update the forward model to the environments.
 
         :param error: of its last prediction.
-        :raises ForwardModelError: if the forward model that was asked for cannot follow.
-        :raises ValueError: if the settings make no sense with random dynamics.
+        :raises ForwardModelError: if the requested forward model cannot simulate the changed environments.
+        :raises ValueError: if the settings do not fit random dynamics.
         """
 
     @property
     def memory(self) -> dict[str, Any]:
-        """What was noticed about the environments, as plain values."""
+        """What the source has learned about the environments, as plain values."""
         return {
             "kind": self.model.kind,
             "deterministic": self.model.deterministic,
@@ -133,7 +133,7 @@ class ExactRoots(RootSource):
     """The states of the environments themselves.
 
     :param vec_env: the environments; those in this process are wrapped in place.
-    :param settings: of the search.
+    :param settings: settings of the search.
     :param normalizer: the ``VecNormalize`` whose reward scale the critics learned, if any.
     :raises SnapshotUnsupportedError: if an environment's state cannot be captured.
     :raises ForwardModelError: if the requested forward model cannot simulate the environments.
@@ -153,22 +153,22 @@ class ExactRoots(RootSource):
         )
 
     def read_states(self, envs: Sequence[int]) -> list[Any]:
-        """Read the environments' present states, also where the simulator was exchanged.
+        """Read the environments' current states, also after they replaced their simulator.
 
-        :param envs: which environments.
+        :param envs: indices of environments.
         """
         known = self.model.deterministic
         try:
             states = self.model.read_roots(envs)
-        except ForwardModelError as reason:  # the environment exchanged its simulator
+        except ForwardModelError as reason:  # the environment replaced its simulator
             self._follow_environment(f"{reason} ")
             return self.model.read_roots(envs)
-        if self.model.deterministic != known:  # what needs a reset with options shows only after it
+        if self.model.deterministic != known:  # environments that need reset options are probed only now
             check_dynamics(self.settings, self.model.deterministic)
         return states
 
     def _present_observations(self, observations: Observations, envs: Sequence[int]) -> Observations:
-        """The environments' own observations, checked against those that the agent was given."""
+        """The environments' own observations, checked against those that the agent got."""
         present = self.environments.apply(envs, _last_observation)
         for row, observation in enumerate(present):
             if observation is None:
@@ -182,7 +182,7 @@ class ExactRoots(RootSource):
                 "The observations to act on are not those of the environments' present states. A search "
                 "plans from the environments it was given: act in those, step them only through their "
                 "SnapshotEnvWrapper, and keep wrappers that alter observations inside it. A callback needs "
-                "environments of its own: EvalCallback(make_vec_env(...)), not "
+                "its own environments: EvalCallback(make_vec_env(...)), not "
                 "EvalCallback(model.get_env()). If they were used for something else between two calls of "
                 "learn, call set_env before the second."
             )
@@ -202,19 +202,19 @@ class ExactRoots(RootSource):
             last = happened.infos[env].get("terminal_observation")
             if last is None:
                 error = max(error, difference(row_of(predicted, row), row_of(happened.observations, env)))
-            else:  # as the environment returned it, which the others no longer are
+            else:  # the environment's own last observation; the current one is of the next episode
                 expected = self.view.observe_last(take_rows(step.observations, np.array([row])))
                 error = max(error, difference(row_of(expected, 0), self.view.as_kept(last)))
-            # A vectorized environment hands rewards on as float32.
+            # Vectorized environments return rewards as float32.
             error = max(error, difference(np.float32(step.rewards[row]), np.float32(happened.rewards[env])))
         if not error:
             self._previous_step_differed = False
         return error
 
     def resync(self, error: float) -> None:
-        """Follow environments that were edited, or are not deterministic after all.
+        """Adapt to environments that were edited, or are not deterministic.
 
-        The forward model is refreshed, then replaced, then told so.
+        The forward model is refreshed first, then replaced by a pool, then treated as random.
         """
         self._follow_environment(f"The forward model's prediction differs from reality by {error:.3g}. ")
         self._previous_step_differed = True
@@ -231,13 +231,13 @@ class ExactRoots(RootSource):
         if not self._previous_step_differed:
             try:
                 self.model.refresh()
-                _warn(message + "It was edited; the forward model was rebuilt from its present values.")
+                _warn(message + "It was edited; the forward model was rebuilt from its current values.")
                 return
             except ForwardModelError as reason:
                 message += f"{reason} "
         if self.settings.forward_model != "auto":
             raise ForwardModelError(
-                message + "forward_model='pool' copies whole environments and can follow."
+                message + "forward_model='pool' copies whole environments and can simulate them."
             )
         self._simulate_with("pool")
         _warn(message + f"Now simulating with: {self.model.description}.")
@@ -266,14 +266,14 @@ class ExactRoots(RootSource):
 
 
 class LearnedRoots(RootSource):
-    """The agent's observations, from which the model that it learned goes on.
+    """The agent's observations, from which its learned model simulates.
 
-    The environments may be of any kind: they are neither wrapped nor copied. The cross-entropy method starts
-    anew at every decision, since observations do not tell which steps were taken since the last one.
+    The environments may be of any kind: they are neither wrapped nor copied. The cross-entropy method has no
+    warm start, since observations do not tell which steps were taken since the last decision.
 
     :param agent: an agent that learns a model, or has learned one.
     :param vec_env: the environments.
-    :param settings: of the search.
+    :param settings: settings of the search.
     :param normalizer: the ``VecNormalize`` whose reward scale the critics learned, if any.
     :raises ValueError: if the agent has no learned model.
     """
@@ -335,11 +335,11 @@ class LearnedRoots(RootSource):
         return Roots(self.model, list(seen), seen)
 
     def episode_clocks(self, envs: Sequence[int]) -> list[EpisodeClock]:
-        # Never the same moment twice: no plan is recalled.
+        # Never the same clock twice, so no plan is recalled.
         return [(self._n_searches, 0)] * len(envs)
 
     def error(self, prediction: Prediction, happened: EnvironmentStep) -> float | None:
-        """The error of the predicted step, measured as the held-out error is."""
+        """The error of the predicted step, measured like the held-out error."""
         envs = np.asarray(prediction.envs)
         if not len(envs):
             return None

@@ -1,8 +1,8 @@
 """The paper's reward saturation: whether the return has stopped improving, from comparable episodes.
 
-Searched episodes return more than others, so that searching less lowers the return at once. What is compared
-is therefore alike: episodes that began after the last change of the share, and searched ones with searched
-ones only.
+Searched episodes return more than others, so searching less lowers the return immediately. Only comparable
+episodes are therefore compared: those that began after the last change of the share, and searched ones with
+searched ones only.
 """
 
 from collections.abc import Sequence
@@ -10,11 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-#: A window with fewer episodes says nothing.
+#: Windows with fewer episodes are ignored.
 _LEAST = 2
-#: Odds, as a logarithm, against what returns lack adding up by chance (Page's test).
+#: Logarithm of the odds that the accumulated shortfall is not chance (Page's test).
 _ODDS = 9.0
-#: The mean of the episodes since a change counts so many standard errors lower than it is.
+#: Standard errors that are subtracted from the mean of the episodes since a change.
 _CAUTION = 2.0
 _START, _END, _TOTAL, _SEARCHED = range(4)
 
@@ -24,8 +24,8 @@ class Episode(NamedTuple):
 
     :param start: environment steps when it began.
     :param end: environment steps when it ended.
-    :param total: its return, of the environment's own rewards.
-    :param searched: which kind it is: searched or not, if whole episodes are; otherwise True.
+    :param total: its return, without normalisation.
+    :param searched: whether it was searched, if whole episodes are; otherwise True.
     """
 
     start: int
@@ -37,31 +37,31 @@ class Episode(NamedTuple):
 class Saturation:
     """Decides between the full and the reduced share of searched decisions.
 
-    Windows end at the present step. With the full share it compares the last one with the one before; with
-    the reduced share it compares the last one with the best that the mean of all episodes since the change
-    has been (the best window would be best by luck), and adds up over the episodes what they lack, since one
-    window in many is low by chance. Differences are measured in parts of all that was gained since the
-    training began, whatever the scale of rewards is.
+    Windows end at the current step. At the full share it compares the last window with the one before. At the
+    reduced share it compares the last window with the highest mean so far of all episodes since the change
+    (the best window would be best by luck), and accumulates the shortfall of the episodes, since some windows
+    are low by chance. Differences are fractions of the gain since the training began, whatever the scale of
+    rewards.
 
-    :ivar is_reduced: whether the share is the reduced one.
-    :ivar changes: how often that has changed.
+    :ivar is_reduced: whether the share is reduced.
+    :ivar changes: number of changes of the share.
     """
 
     def __init__(self) -> None:
         self.is_reduced = False
         self.changes = 0
         self._since: int | None = None
-        #: ``[n, 4]``, as :class:`Episode`: those of the last two windows.
+        #: ``[n, 4]``, fields of :class:`Episode`, of the last two windows.
         self._episodes = np.zeros((0, 4))
         self._baseline: float | None = None
         self._gain = 0.0
-        #: Of the episodes since the change, by kind: count and mean, and the best that the mean has been.
+        #: Of the episodes since the change, by kind: count and mean, and the highest mean so far.
         self._since_change: dict[bool, tuple[int, float]] = {}
         self._best: dict[bool, float] = {}
         self._lacking = 0.0
 
     def begin(self, step: int) -> None:
-        """Episodes that begin from now on are searched as the share says.
+        """Note the step from which on the share applies to new episodes.
 
         :param step: environment steps so far; only the first call counts.
         """
@@ -71,12 +71,12 @@ class Saturation:
     def update(
         self, finished: Sequence[Episode], window: int, tolerance: float, recovery: float, step: int
     ) -> None:
-        """Learn from finished episodes, and change the share if it is time to.
+        """Record finished episodes, and change the share if the return is saturated or has fallen.
 
         :param finished: episodes that ended at this step.
-        :param window: environment steps.
-        :param tolerance: part of the gain by which windows of a saturated return may differ.
-        :param recovery: part of the gain below the best at which the return has fallen.
+        :param window: length of a window in environment steps.
+        :param tolerance: fraction of the gain by which windows of a saturated return may differ.
+        :param recovery: fraction of the gain below the best at which the return has fallen.
         :param step: environment steps so far.
         """
         kept = self._episodes[self._episodes[:, _END] > step - 2 * window]
@@ -100,7 +100,7 @@ class Saturation:
                 self._change(step)
         elif settled:
             change = _difference(last, _means(before))
-            # A return that has never risen above its own noise is not saturated: it has yet to improve.
+            # A return that has not risen above its own noise yet is not saturated.
             has_risen = rise > float(last[:, _TOTAL].std())
             if has_risen and change is not None and abs(change) <= tolerance * self._gain:
                 self._change(step)
@@ -114,12 +114,12 @@ class Saturation:
     def _has_fallen(
         self, finished: Sequence[Episode], comparable: np.ndarray, last: np.ndarray, least: float
     ) -> bool:
-        """Whether returns have been lower than the best for so long that it is not chance.
+        """Whether returns have been below the best for too long to be chance.
 
         :param finished: episodes that began after the last change and ended at this step.
-        :param comparable: ``[n, 4]``, of the last two windows.
-        :param last: ``[n, 4]``, of the last one.
-        :param least: how much lower, at least.
+        :param comparable: ``[n, 4]``, episodes of the last two windows.
+        :param last: ``[n, 4]``, episodes of the last window.
+        :param least: the smallest difference that counts.
         """
         variance = _variance(comparable)
         for kind, (count, mean) in self._since_change.items():
@@ -140,15 +140,15 @@ class Saturation:
 
 
 def _means(episodes: np.ndarray) -> dict[bool, float]:
-    """The mean return of each kind of episode, if there are enough of it.
+    """The mean return of each kind of episode with enough episodes.
 
-    :param episodes: ``[n, 4]``, as :class:`Episode`.
+    :param episodes: ``[n, 4]``, fields of :class:`Episode`.
     """
     return {kind: float(totals.mean()) for kind, totals in _returns(episodes).items()}
 
 
 def _returns(episodes: np.ndarray) -> dict[bool, np.ndarray]:
-    """The returns of each kind of episode, if there are enough of it."""
+    """The returns of each kind of episode with enough episodes."""
     by_kind = {kind: episodes[episodes[:, _SEARCHED] == kind, _TOTAL] for kind in (False, True)}
     return {kind: totals for kind, totals in by_kind.items() if len(totals) >= _LEAST}
 
@@ -156,7 +156,7 @@ def _returns(episodes: np.ndarray) -> dict[bool, np.ndarray]:
 def _variance(episodes: np.ndarray) -> float:
     """The variance of returns around the mean of their kind.
 
-    :param episodes: ``[n, 4]``, as :class:`Episode`, two or more.
+    :param episodes: ``[n, 4]``, fields of :class:`Episode`, two or more.
     """
     returns = _returns(episodes)
     squares = sum(float(np.square(totals - totals.mean()).sum()) for totals in returns.values())
@@ -164,11 +164,11 @@ def _variance(episodes: np.ndarray) -> float:
 
 
 def _difference(episodes: np.ndarray, reference: dict[bool, float]) -> float | None:
-    """How much more the episodes return than those of a reference, kind by kind.
+    """How much more the episodes return than a reference, averaged over kinds.
 
-    :param episodes: ``[n, 4]``, as :class:`Episode`.
+    :param episodes: ``[n, 4]``, fields of :class:`Episode`.
     :param reference: mean returns by kind.
-    :return: ``None`` if they have no kind in common.
+    :return: ``None`` without a common kind.
     """
     differences = {
         kind: mean - reference[kind] for kind, mean in _means(episodes).items() if kind in reference

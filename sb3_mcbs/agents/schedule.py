@@ -1,4 +1,4 @@
-"""When to search, and with how much effort, over the course of a training."""
+"""When to search during training, and how wide and deep."""
 
 import functools
 from dataclasses import dataclass, replace
@@ -13,7 +13,7 @@ from sb3_mcbs.search.strategy_settings import BeamSettings, CEMSettings, TreeSet
 
 SCHEDULES = ("constant", "saturation", "anneal")
 UNITS = ("step", "episode")
-#: Part of ``search_share`` that is left while returns are saturated, if nothing else is said.
+#: Fraction of ``search_share`` while returns are saturated, without ``final_search_share``.
 _LEFT_WHEN_SATURATED = 0.2
 
 
@@ -21,26 +21,25 @@ _LEFT_WHEN_SATURATED = 0.2
 class ScheduleSettings(CheckedSettings):
     """Which decisions of a training are searched, and how wide and deep.
 
-    The first three are keywords of an agent's constructor, the others are given in ``schedule_kwargs``.
+    The first three are keywords of an agent's constructor, the others are keys of ``schedule_kwargs``.
 
     :param search_schedule: ``"constant"``; ``"saturation"`` (``search_share`` until the return stops
         improving, then ``final_search_share``, and back when returns fall); ``"anneal"`` (from
         ``search_share``, ``beam_width`` and ``rollout_depth`` to ``final_search_share``,
         ``final_beam_width`` and ``final_rollout_depth``, linearly over the training).
-    :param search_share: the share of decisions that are searched. At the others the agent acts as it does
-        without search, with its own exploration noise.
-    :param search_unit: ``"step"`` draws for every step whether it is searched, ``"episode"`` for every
-        episode.
+    :param search_share: the share of decisions that are searched. At the others the agent acts without
+        search, with its own exploration noise.
+    :param search_unit: whether search is drawn for every ``"step"`` or every ``"episode"``.
     :param final_search_share: see ``search_schedule``. ``None``: a fifth of ``search_share`` with
         ``"saturation"``, no change with ``"anneal"``.
-    :param final_beam_width: where ``"anneal"`` ends. ``None``: no change.
-    :param final_rollout_depth: where ``"anneal"`` ends. ``None``: no change.
-    :param saturation_window: environment steps over which ``"saturation"`` averages returns. Nothing changes
-        within two of them after a change.
-    :param saturation_tolerance: the return has stopped improving if it differs from that of the window
-        before by no more than this part of all that was gained since the training began.
+    :param final_beam_width: final width of ``"anneal"``. ``None``: no change.
+    :param final_rollout_depth: final depth of ``"anneal"``. ``None``: no change.
+    :param saturation_window: environment steps over which ``"saturation"`` averages returns. The share does
+        not change again within two windows.
+    :param saturation_tolerance: the return has stopped improving if it differs from that of the previous
+        window by at most this fraction of the gain since the training began.
     :param recovery_tolerance: returns have fallen if they are below the best mean since the last change by
-        more than this part of the same, and for so long that it is not chance.
+        more than this fraction of the gain, and for too long to be chance.
     :raises TypeError: if a value has the wrong type.
     :raises ValueError: if a value is out of range, or has no meaning with the schedule.
     """
@@ -98,13 +97,13 @@ class ScheduleSettings(CheckedSettings):
                 )
             if self.recovery_tolerance <= self.saturation_tolerance:
                 raise ValueError(
-                    "recovery_tolerance must be above saturation_tolerance, or the schedule would go to and "
-                    f"fro; got {self.recovery_tolerance} and {self.saturation_tolerance}."
+                    "recovery_tolerance must be above saturation_tolerance, or the schedule would "
+                    f"oscillate; got {self.recovery_tolerance} and {self.saturation_tolerance}."
                 )
 
     @property
     def share_at_end(self) -> float:
-        """``final_search_share``, or what ``None`` stands for."""
+        """``final_search_share``, or its default."""
         if self.final_search_share is not None:
             return self.final_search_share
         return self.search_share * (_LEFT_WHEN_SATURATED if self.search_schedule == "saturation" else 1.0)
@@ -115,10 +114,10 @@ class ScheduleSettings(CheckedSettings):
         return self.search_share == 1 and self.share_at_end == 1
 
     def check_search(self, settings: SearchSettings) -> None:
-        """Refuse ends of an anneal that make no search.
+        """Refuse final values of ``"anneal"`` that are not valid for the search.
 
-        :param settings: where it begins.
-        :raises ValueError: says which setting, and why.
+        :param settings: settings at the beginning of the training.
+        :raises ValueError: names the setting and the reason.
         """
         if self.final_beam_width is not None and isinstance(settings, TreeSettings) and settings.n_proposals:
             raise ValueError(
@@ -139,8 +138,8 @@ class ScheduleSettings(CheckedSettings):
         most = settings.max_beam_width if isinstance(settings, BeamSettings) else None
         if self.final_beam_width is not None and most is not None:
             raise ValueError(
-                "final_beam_width has no meaning with max_beam_width, which is the number of candidates that "
-                "is enough: leave one of the two out."
+                "final_beam_width has no meaning with max_beam_width, which already limits the number of "
+                "candidates: leave one of the two out."
             )
         end = self.annealed(settings, progress=1.0)
         largest = {name: max(getattr(settings, name), value) for name, value in end.items()}
@@ -151,11 +150,11 @@ class ScheduleSettings(CheckedSettings):
                 raise ValueError(f"{when} the anneal: {reason}") from reason
 
     def annealed(self, settings: SearchSettings, progress: float) -> dict[str, int]:
-        """What is annealed, at some moment of the training.
+        """The annealed settings at some point of the training.
 
-        :param settings: where it begins.
+        :param settings: settings at the beginning of the training.
         :param progress: of the training, from 0 to 1.
-        :return: by the names of the search's settings.
+        :return: values by the names of the search's settings.
         """
         ends = {"beam_width": self.final_beam_width, "rollout_depth": self.final_rollout_depth}
         begins = {name: getattr(settings, name) for name in ends}
@@ -167,13 +166,13 @@ class ScheduleSettings(CheckedSettings):
 
 
 class SearchSchedule:
-    """Says at every step which environments are searched, and how wide and deep.
+    """Decides at every step which environments are searched, and how wide and deep.
 
-    Its random numbers are its own, and as many at every step whatever the settings are, so that neither the
-    environments nor the agent nor the search notice which schedule there is.
+    It has its own generator and always draws the same number of values, so the schedule does not affect the
+    random numbers of the environments, the agent or the search.
 
-    :param settings: of the schedule; may be exchanged later.
-    :param seed: of those random numbers.
+    :param settings: settings of the schedule; may be replaced later.
+    :param seed: seed of the generator.
 
     :ivar saturation: whether returns have stopped improving.
     """
@@ -186,21 +185,21 @@ class SearchSchedule:
         self.begin_episodes(0, 0)
 
     def begin_episodes(self, n_envs: int, step: int) -> None:
-        """All environments were reset.
+        """Begin new episodes in all environments.
 
-        :param n_envs: how many there are.
-        :param step: environment steps so far; fewer than before if a training begins anew.
+        :param n_envs: number of environments.
+        :param step: environment steps so far; fewer than before if a new training starts.
         """
         if step < self._last_step:
             self.saturation = Saturation()
         self._last_step = step
         self._starts = np.full(n_envs, step)
         self._returns = np.zeros(n_envs)
-        #: Whether the episode is searched; -1 if that was not drawn yet.
+        #: Whether the episode is searched; -1 if not drawn yet.
         self._flags = np.full(n_envs, -1)
 
     def share(self, progress: float) -> float:
-        """The share of decisions that are searched at present.
+        """The current share of decisions that are searched.
 
         :param progress: of the training, from 0 to 1.
         """
@@ -210,11 +209,11 @@ class SearchSchedule:
         return settings.search_share + (settings.share_at_end - settings.search_share) * progress
 
     def settings_at(self, settings: SearchSettings, progress: float) -> SearchSettings:
-        """The search's settings at present.
+        """The current settings of the search.
 
-        :param settings: where the training begins.
+        :param settings: settings at the beginning of the training.
         :param progress: of the training, from 0 to 1.
-        :return: the same with another width and depth, if they are annealed.
+        :return: the same, with another width and depth if they are annealed.
         """
         changes = self.settings.annealed(settings, progress)
         return _with(settings, **changes) if changes else settings
@@ -234,9 +233,9 @@ class SearchSchedule:
         return self._flags == 1
 
     def record_rewards(self, rewards: np.ndarray, dones: np.ndarray, step: int) -> None:
-        """Learn what the environments returned.
+        """Record the environments' rewards.
 
-        :param rewards: ``[n_envs]``, of the environments, not normalised.
+        :param rewards: ``[n_envs]``, not normalised.
         :param dones: ``[n_envs]``, whether an episode ended, for whatever reason.
         :param step: environment steps so far.
         """
@@ -262,5 +261,5 @@ class SearchSchedule:
             )
 
 
-#: Made and checked once, not at every decision.
+#: Cached, so that settings are checked once, not at every decision.
 _with = functools.lru_cache(maxsize=16)(replace)

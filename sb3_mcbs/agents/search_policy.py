@@ -1,4 +1,4 @@
-"""Act with search with any trained agent."""
+"""Search around any trained agent."""
 
 import operator
 from collections.abc import Collection
@@ -27,9 +27,9 @@ from sb3_mcbs.search import SearchResult, SearchSettings, make_settings, with_pr
 from sb3_mcbs.search.settings import merged
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 
-#: What is not simply replaced when it is set.
+#: Attributes with special handling when they are set.
 _HELD = ("model", "vec_env", "settings", "preset")
-#: The settings that are attributes.
+#: Settings that are attributes.
 _OWN = (*SearchSettings.flat, "strategy", "search_kwargs", "model_kwargs")
 
 
@@ -37,45 +37,45 @@ class SearchPolicy(RefusesOldNames, Searching):
     """
     A trained agent that looks ahead before it acts, with SB3's ``predict`` signature.
 
-    Every call of :meth:`predict` plans from the present states of ``vec_env``, so the actions are for that
-    environment and no other::
+    Every call of :meth:`predict` plans from the current states of ``vec_env``, so the actions are valid in
+    that environment only::
 
         policy = SearchPolicy(model, vec_env, beam_width=6, rollout_depth=3)
         evaluate_policy(policy, vec_env)
 
     SAC and TQC propose their mean action; TQC's value is the mean over all quantiles.
-    Settings are attributes: one that is set (``policy.beam_width = 20``) holds from the next decision on, and
-    ``policy.settings = ...`` sets them all. Attributes that this class does not have are those of the agent
-    (``save``, ``get_env``, ``logger``, ...).
+    Settings are attributes: setting one (``policy.beam_width = 20``) applies from the next decision on, and
+    ``policy.settings = ...`` sets them all. Other attributes are those of the agent (``save``, ``get_env``,
+    ``logger``, ...).
 
     :param model: a TD3, DDPG, SAC or TQC agent, or one that searched in training (
         :class:`~sb3_mcbs.MCBS`)
-    :param vec_env: the environment to act in, at most wrapped further by ``VecEnv`` wrappers that alter
-        nothing. Environments in this process are wrapped for snapshots in place. A ``gym.Env`` must be
-        wrapped in :class:`~sb3_mcbs.SnapshotEnvWrapper` outermost.
-    :param seed: seed of the search's own generator; None: a fresh one
+    :param vec_env: the environment to act in. Further ``VecEnv`` wrappers around it must not alter anything.
+        Environments in this process are wrapped for snapshots in place. A ``gym.Env`` must have
+        :class:`~sb3_mcbs.SnapshotEnvWrapper` outermost.
+    :param seed: seed of the search's own generator; None: random
     :param normalize_reward: whether the critics were trained on rewards that ``VecNormalize`` scaled.
-        None: found out from the environment that the agent was trained in, or assumed from the statistics
-    :param beam_width: this and the following are those of :class:`~sb3_mcbs.MCBSTD3`; what is not given, also
-        within ``search_kwargs`` and ``model_kwargs``, is what the agent trained with, or the preset's, or the
-        default
+        None: inferred from the environment that the agent was trained in, or from the statistics
+    :param beam_width: this and the following are those of :class:`~sb3_mcbs.MCBSTD3`. Those that are not
+        given, including keys of ``search_kwargs`` and ``model_kwargs``, are the agent's, or with ``preset``
+        those of the preset, or the defaults
     :param rollout_depth: simulated steps per rollout
     :param n_simulations: rollouts per candidate
-    :param beam_noise: standard deviation of the noise that makes candidates
+    :param beam_noise: standard deviation of candidates, in scaled actions
     :param strategy: ``"beam"``, ``"tree"`` or ``"cem"``
-    :param search_kwargs: further settings of the strategy, see :class:`~sb3_mcbs.BeamSettings`,
+    :param search_kwargs: additional settings of the strategy, see :class:`~sb3_mcbs.BeamSettings`,
         :class:`~sb3_mcbs.TreeSettings` and :class:`~sb3_mcbs.CEMSettings`
-    :param preset: a name of :data:`~sb3_mcbs.search.PRESETS`: where the settings start from, instead of
-        those that the agent trained with
-    :param forward_model: what simulates
+    :param preset: one of :data:`~sb3_mcbs.search.PRESETS`, from which the settings start instead of the
+        agent's
+    :param forward_model: the simulator
     :param model_kwargs: ``n_threads``
-    :param matmul_precision: of the networks' float32 products
+    :param matmul_precision: precision of the networks' float32 products
     """
 
-    #: What an exact checkpoint does not contain, and why.
+    #: Attributes that exact checkpoints do not contain, and why.
     not_checkpointed: ClassVar[Collection[str]] = {
-        "planner": "its forward model simulates the environments as they are; what it remembers is saved",
-        "last_result": "of the last step; made anew before it is read",
+        "planner": "its forward model is made from the environments; its memory is saved",
+        "last_result": "of the last step; computed again before it is read",
     }
 
     def __init__(
@@ -102,7 +102,7 @@ class SearchPolicy(RefusesOldNames, Searching):
             raise TypeError(f"normalize_reward must be True, False or None, got {normalize_reward!r}.")
         self.model = model
         if preset is None and isinstance(model, MCBS):
-            if rollout_depth == 0:  # where nothing simulates, no model does
+            if rollout_depth == 0:  # nothing is simulated, so no learned model is used
                 given = {"forward_model": "auto", **given}
             self.settings = make_settings(**merged(model.search_settings.grouped(), given))
         else:
@@ -110,7 +110,7 @@ class SearchPolicy(RefusesOldNames, Searching):
         self.vec_env = _as_agents_vec_env(vec_env, model)
         self.rng = np.random.default_rng(seed)
         self.last_result: SearchResult | None = None
-        # A copy, so that acting elsewhere does not change the training.
+        # A copy, so that acting here does not change the training.
         recent_actions = deepcopy(model.recent_actions) if isinstance(model, MCBS) else None
         self.planner = Planner(model, self.vec_env, self.settings, normalize_reward, recent_actions)
 
@@ -129,7 +129,7 @@ class SearchPolicy(RefusesOldNames, Searching):
         elif name in _OWN:
             changes = {name: value}
             if changes == {"rollout_depth": 0} and self.settings.forward_model == "ensemble":
-                changes["forward_model"] = "auto"  # where nothing simulates, no model does
+                changes["forward_model"] = "auto"  # nothing is simulated
             self._change(changes)
         elif name in REMOVED or name in MOVED:
             refuse_old_names({name: value})
@@ -164,14 +164,14 @@ class SearchPolicy(RefusesOldNames, Searching):
         deterministic: bool = False,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """
-        Search for the best actions in the present states of ``vec_env``.
+        Search for the best actions in the current states of ``vec_env``.
 
-        :param observation: the present observations of ``vec_env``; images also with the channels last
+        :param observation: the current observations of ``vec_env``; images also with the channels last
         :param state: not used
         :param episode_start: not used
         :param deterministic: has no effect. The best candidate is always taken, without exploration noise;
-            the candidates are random draws from this object's own generator in either case, so the same
-            ``seed`` and the same calls give the same actions.
+            candidates are sampled from this object's own generator, so the same ``seed`` and the same calls
+            give the same actions.
         :return: the actions and ``state``
         """
         space = self.model.observation_space
@@ -213,7 +213,7 @@ def _as_vec_env(env: VecEnv | gym.Env) -> VecEnv:
 
 
 def _as_agents_vec_env(env: VecEnv | gym.Env, model: OffPolicyAlgorithm) -> VecEnv:
-    """Return an environment to act in as the agent sees it.
+    """Return an environment to act in, in the agent's form.
 
     :raises ValueError: if its spaces are not the agent's.
     """
@@ -231,7 +231,7 @@ def _as_agents_vec_env(env: VecEnv | gym.Env, model: OffPolicyAlgorithm) -> VecE
 
 
 def _are_alike(one: gym.Space, other: gym.Space) -> bool:
-    """Whether observations of two spaces have the same entries; their bounds do not matter to an agent."""
+    """Whether observations of two spaces have the same entries; their bounds do not matter."""
     if isinstance(one, gym.spaces.Dict) and isinstance(other, gym.spaces.Dict):
         return one.spaces.keys() == other.spaces.keys() and all(_are_alike(one[k], other[k]) for k in one)
     if isinstance(one, gym.spaces.Box) and isinstance(other, gym.spaces.Box):
@@ -247,7 +247,7 @@ def _channels_first(observation: Any, space: gym.Space) -> Any:
 
 
 def _add_batch_axis(observation: Any, space: gym.Space) -> tuple[Any, bool]:
-    """Give a single observation the axis of environments.
+    """Add the environments' axis to a single observation.
 
     :return: the batched observation, and whether the axis was added.
     """

@@ -1,10 +1,9 @@
 """Critic targets that are rolled forward in the simulator: model-based value expansion.
 
-After a stored transition the simulator goes on, from the state that it was really in, with the actions that
-the present target actor takes (of SAC and TQC: drawn from the present actor, whose entropy counts at every
-step as in their own targets; Feinberg et al., 2018, with the simulator for a model). The critics bootstrap
-some steps later: rewards are exact, actions are not old ones as in the returns of ``n_steps``, and values
-travel several steps in one update.
+From the stored state after a transition, the simulator takes the actions of the current target actor (SAC
+and TQC: sampled from the current actor, with an entropy term at every step as in their own targets;
+Feinberg et al., 2018, with the simulator as the model). The target then bootstraps from the critics: rewards
+are exact, actions are not old ones as with ``n_steps``, and values propagate several steps per update.
 """
 
 import functools
@@ -37,16 +36,16 @@ logger = logging.getLogger("sb3_mcbs")
 
 Samples = ReplayBufferSamples | DictReplayBufferSamples
 
-#: More steps than this after every sampled transition are a mistake.
+#: A larger value is surely a mistake.
 MAX_EXPANSION = 1000
 
 
 @dataclass(frozen=True)
 class ValueExpansionSettings(CheckedSettings):
-    """Whether the critics' targets look further than one step.
+    """How far critic targets are rolled forward.
 
-    :param value_expansion: steps that are simulated after a sampled transition, with the present target
-        actor, before the target bootstraps from the critics. 0: none, as SB3.
+    :param value_expansion: steps that are simulated after a sampled transition, with the current target
+        actor, before the target bootstraps from the critics. 0: none, as in SB3.
     :param expanded_share: the share of every batch whose transitions are expanded. Every gradient step
         simulates ``value_expansion`` environment steps for each of them.
     :raises TypeError: if a value has the wrong type.
@@ -65,10 +64,10 @@ class ValueExpansionSettings(CheckedSettings):
             raise ValueError("value_expansion needs an expanded_share above 0: nothing would be expanded.")
 
     def check_search(self, settings: SearchSettings) -> None:
-        """Refuse what does not go together.
+        """Refuse settings of the search that do not work with value expansion.
 
-        :param settings: of the search.
-        :raises ValueError: says which setting, and why.
+        :param settings: settings of the search.
+        :raises ValueError: names the setting and the reason.
         """
         if not self.value_expansion:
             return
@@ -79,41 +78,41 @@ class ValueExpansionSettings(CheckedSettings):
             )
         if settings.forward_model == "ensemble":
             raise ValueError(
-                "value_expansion goes on in the simulator, which forward_model='ensemble' does without: "
-                "leave one of the two out."
+                "value_expansion needs the simulator, which forward_model='ensemble' does without: leave one "
+                "of the two out."
             )
 
     def check_buffer(self, optimize_memory_usage: bool) -> None:
-        """Refuse replay buffers that do not keep what is needed.
+        """Refuse replay buffers without next observations.
 
-        :param optimize_memory_usage: as SB3's replay buffers have it.
-        :raises ValueError: says which setting, and why.
+        :param optimize_memory_usage: of the replay buffer.
+        :raises ValueError: names the setting and the reason.
         """
         if self.value_expansion and optimize_memory_usage:
             raise ValueError(
-                "value_expansion goes on from the last observation of a transition, which a replay buffer "
-                "with optimize_memory_usage does not keep at the end of an episode: leave that out."
+                "value_expansion needs the last observation of every transition, which a replay buffer with "
+                "optimize_memory_usage does not keep at the end of an episode: leave that out."
             )
 
 
-#: What is kept beside a replay buffer's rows; a saved buffer has it under these names.
+#: The additional arrays of a replay buffer; a saved buffer has them under these names.
 ARRAYS = ("expansion_states", "expansion_held")
 
 
 class ExpandedReplayBuffer(ReplayBuffer):
-    """A replay buffer that keeps the simulator's states, and rolls a part of what it samples forward.
+    """A replay buffer that stores simulator states, and rolls some of its samples forward.
 
-    For every row and environment it keeps the state after the step, and whether there is one (not where the
-    episode ended). It is made of a replay buffer of any class by :func:`expand`, and pickled as one of that
-    class, so that whoever loads it needs nothing of this package.
+    For every row and environment it stores the state after the step, and whether there is one (not where the
+    episode ended). :func:`expand` converts a replay buffer of any class. It is pickled as that class, so it
+    can be loaded without this package.
 
-    :ivar agent: the :class:`~sb3_mcbs.MCBS` agent that learns from it; what is simulated is added to its
+    :ivar agent: the :class:`~sb3_mcbs.MCBS` agent that learns from it; simulated steps are added to its
         ``n_simulated_steps``.
-    :ivar expansion_states: ``[buffer_size, n_envs, state_size]``.
-    :ivar expansion_held: ``[buffer_size, n_envs]`` bool.
+    :ivar expansion_states: ``[buffer_size, n_envs, state_size]``, the state after each step.
+    :ivar expansion_held: ``[buffer_size, n_envs]`` bool, whether that state is stored.
     """
 
-    #: The class that it would be without expansion.
+    #: Its class without expansion.
     base_class: ClassVar[type[ReplayBuffer]]
     not_checkpointed = ("agent",)
 
@@ -130,21 +129,20 @@ class ExpandedReplayBuffer(ReplayBuffer):
         done: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
-        """Store a step, and the states that the environments are in after it.
+        """Store a step, and the environments' states after it.
 
-        :param done: ``[n_envs]``, whether the episode ended: the environment is in another one then.
+        :param done: ``[n_envs]``, whether the episode ended: the state is then of the next one.
         """
         self.expansion_states[self.pos] = batched_states(self.agent)
         self.expansion_held[self.pos] = ~done.astype(bool)
         super().add(obs, next_obs, action, reward, done, infos)
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> Any:
-        """Draw transitions, of which ``expanded_share`` are expanded.
+        """Sample transitions, and expand ``expanded_share`` of them.
 
-        :param batch_size: how many.
+        :param batch_size: number of transitions.
         :param env: normalises observations and rewards.
-        :return: as of a buffer of transitions over several steps. Those that ended an episode are as they
-            were.
+        :return: n-step transitions. Those that ended an episode are not expanded.
         """
         agent = self.agent
         n_expanded = round(agent.expanded_share * batch_size)
@@ -159,10 +157,10 @@ class ExpandedReplayBuffer(ReplayBuffer):
         return type(samples[0])(*(_joined(fields) for fields in zip(*samples, strict=True)))
 
     def sample_expanded(self, n: int, rng: np.random.Generator, env: VecNormalize | None) -> Samples:
-        """Draw transitions, and go on from them.
+        """Sample transitions, and roll them forward.
 
-        :param n: how many.
-        :param rng: draws them.
+        :param n: number of transitions.
+        :param rng: samples them, and is given to the forward model.
         :param env: normalises observations and rewards.
         """
         at = rng.integers(0, self.size(), n), rng.integers(0, self.n_envs, n)
@@ -187,11 +185,13 @@ class ExpandedReplayBuffer(ReplayBuffer):
         rng: np.random.Generator,
         env: VecNormalize | None,
     ) -> None:
-        """Simulate the target actor from some states.
+        """Simulate the target actor from stored states.
 
         :param states: ``[m, state_size]``.
-        :param going: ``[m]``, whose states these are.
-        :param path: of all transitions; changed.
+        :param going: ``[m]``, the transitions' indices.
+        :param path: of all transitions; changed in place.
+        :param rng: given to the forward model and the actor.
+        :param env: normalises observations and rewards.
         """
         returns, lengths, terminated, last = path
         agent, planner = self.agent, self.agent.planner
@@ -221,7 +221,7 @@ class ExpandedReplayBuffer(ReplayBuffer):
     def _as_samples(self, at: tuple[np.ndarray, ...], path: "_Path", env: VecNormalize | None) -> Samples:
         """Make a batch, with discounts for the next observations' values.
 
-        :param at: rows and environments ``[n]`` where the transitions begin.
+        :param at: rows and environments ``[n]`` of the transitions.
         """
         first: Any = self._normalize_obs(map_arrays(itemgetter(at), self.observations), env)
         last: Any = self._normalize_obs(path.observations, env)
@@ -242,13 +242,13 @@ class ExpandedReplayBuffer(ReplayBuffer):
 
 
 def expand(buffer: ReplayBuffer, agent: Any) -> None:
-    """Have a replay buffer expand what it samples.
+    """Convert a replay buffer to one that expands its samples.
 
-    The buffer itself becomes an :class:`ExpandedReplayBuffer`: whoever holds it goes on adding to its rows.
+    The buffer becomes an :class:`ExpandedReplayBuffer` in place, so references to it stay valid.
 
     :param buffer: a replay buffer of any class.
     :param agent: see :class:`ExpandedReplayBuffer`.
-    :raises ForwardModelError: if the forward model's states are no arrays.
+    :raises ForwardModelError: if the forward model's states are not arrays.
     """
     if not isinstance(buffer, ExpandedReplayBuffer):
         shape = (buffer.buffer_size, buffer.n_envs, batched_states(agent).shape[1])
@@ -266,7 +266,7 @@ def _expanded_class(base: type[ReplayBuffer]) -> type[ExpandedReplayBuffer]:
 
 
 def drop_states(buffer: ReplayBuffer | None) -> None:
-    """Let go of states that an earlier training kept beside a replay buffer, and this one does not use.
+    """Drop a replay buffer's states from an earlier training that this one does not use.
 
     :param buffer: the replay buffer.
     """
@@ -278,18 +278,18 @@ def drop_states(buffer: ReplayBuffer | None) -> None:
 
 
 def batched_states(agent: Any) -> np.ndarray:
-    """Read the present states of an agent's environments.
+    """Read the current states of an agent's environments.
 
     :param agent: an :class:`~sb3_mcbs.MCBS` agent.
     :return: ``[n_envs, state_size]``.
-    :raises ForwardModelError: if the forward model's states are no arrays.
+    :raises ForwardModelError: if the forward model's states are not arrays.
     """
     planner = agent.planner
     states = planner.read_states() if _is_batched(planner.model) else []
-    if not _is_batched(planner.model):  # the environment may just have exchanged its simulator
+    if not _is_batched(planner.model):  # reading may have replaced the forward model
         raise ForwardModelError(
             "value_expansion keeps the simulator's states in the replay buffer, which needs batched "
-            f"MuJoCo; here simulates: {planner.description}. Leave value_expansion out."
+            f"MuJoCo; the forward model is: {planner.description}. Leave value_expansion out."
         )
     return np.stack(states)
 
@@ -299,12 +299,12 @@ def _is_batched(model: Any) -> bool:
 
 
 class _Path(NamedTuple):
-    """What transitions of several steps came to.
+    """The outcome of n-step transitions.
 
-    :param returns: ``[n]``, discounted sums of rewards as the networks are given them.
-    :param lengths: ``[n]``, steps.
+    :param returns: ``[n]``, discounted sums of rewards, scaled for the networks.
+    :param lengths: ``[n]``, numbers of steps.
     :param terminated: ``[n]`` bool, whether the environment ended the episode.
-    :param observations: ``[n, *]``, the last ones, as replay buffers keep them.
+    :param observations: ``[n, *]``, the last ones, as stored in replay buffers.
     """
 
     returns: np.ndarray
@@ -316,7 +316,7 @@ class _Path(NamedTuple):
 def target_actor(
     agent: Any,
 ) -> Callable[[Observations, np.random.Generator], tuple[np.ndarray, np.ndarray]]:
-    """The actor of the targets as it is now: its actions, and what their entropy adds."""
+    """The current actor of the targets: returns actions and their entropy bonus."""
     if isinstance(agent, SAC | TQC):
         return soft_policy_function(agent)
     policy = policy_function(agent, target=True)
@@ -332,9 +332,9 @@ def _joined(fields: Sequence[Any]) -> Any:
 class Expanding(CheckedRollouts):
     """An agent whose critic targets are rolled forward if ``value_expansion`` is above 0.
 
-    Every step of the environments is compared with what the simulator says of it then, searched or not.
+    Every step, searched or not, is then compared with the simulator's prediction.
 
-    :ivar rollout_rng: draws which transitions are expanded, and nothing else does.
+    :ivar rollout_rng: samples the transitions to expand, separately from the agent's generators.
     """
 
     value_expansion: int
@@ -342,7 +342,7 @@ class Expanding(CheckedRollouts):
     n_simulated_steps: int
     rollout_rng: np.random.Generator | None = None
     _keeps_states = False
-    #: The states that the next actions are executed in.
+    #: The states in which the next actions are executed.
     _states: np.ndarray | None = None
 
     def _set_up_expansion(self, settings: SearchSettings) -> None:
@@ -350,14 +350,14 @@ class Expanding(CheckedRollouts):
         self._keeps_states = self.value_expansion > 0
 
     def _follow_expansion(self, settings: SearchSettings) -> None:
-        """Refuse changed settings that need other arrays beside the replay buffer than there are.
+        """Refuse changed settings that need other arrays in the replay buffer.
 
-        :param settings: of the search.
+        :param settings: settings of the search.
         """
         self._check_expansion(settings)
         if (self.value_expansion > 0) != self._keeps_states:
             raise ValueError(
-                "value_expansion keeps states beside the replay buffer: it can be changed later, but not "
+                "value_expansion stores states in the replay buffer: it can be changed later, but not "
                 "from or to 0; save the agent, and load it with the other settings."
             )
 
@@ -373,19 +373,20 @@ class Expanding(CheckedRollouts):
             batched_states(self)
 
     def _expand_buffer(self) -> None:
-        """Whoever loads a replay buffer exchanges it, so this is done before every use."""
+        """Convert the replay buffer, before every use, since loading one replaces it."""
         if self.value_expansion:
             assert self.replay_buffer is not None
             expand(self.replay_buffer, self)
 
     def _note_states(self) -> None:
-        """The environments are about to be stepped."""
+        """Keep the environments' states before a step."""
         self._states = batched_states(self) if self.value_expansion else None
 
     def _predict_step(self, actions: np.ndarray) -> Prediction | None:
-        """Simulate the step that the environments have just done.
+        """Simulate the last step of the environments.
 
         :param actions: ``[n_envs, act_dim]``, scaled.
+        :return: ``None`` without value expansion or a deterministic forward model.
         """
         if self._states is None:
             return None

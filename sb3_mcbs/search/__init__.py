@@ -1,4 +1,4 @@
-"""Search over a forward model: proposing candidates, rolling them out, scoring, selecting."""
+"""Search with a forward model: propose candidates, roll them out, score and select."""
 
 from sb3_mcbs.search.beam import beam_search
 from sb3_mcbs.search.cem import EpisodeClock, WarmStart

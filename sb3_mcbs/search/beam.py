@@ -1,8 +1,8 @@
 """Monte Carlo Beam Search: Algorithm 1 of the paper for many environments at once.
 
-Arrays in, arrays out. Actions are scaled to [-1, 1] here, as a policy network gives them.
-Axes: ``n_envs`` environments, ``beam`` candidates, ``sim`` simulations, ``act_dim`` action entries.
-Numbers of lines are those of the paper's Algorithm 1.
+Arrays in, arrays out. Actions are scaled to [-1, 1], as a policy network returns them.
+Axes: ``n_envs`` environments, ``beam`` candidates, ``sim`` simulations, ``act_dim`` action dimensions.
+Line numbers are those of the paper's Algorithm 1.
 """
 
 from collections.abc import Sequence
@@ -37,7 +37,7 @@ def beam_search(
     :param settings: width, depth and simulations.
     :param noise: from :func:`draw_noise`.
     :param rng: given to a model with random dynamics, see :meth:`ForwardModel.set_roots`.
-    :return: actions, and what the search found.
+    :return: actions and details of the search.
     """
     policy_actions = functions.policy(roots.observations)
     candidates, beam_noise = propose(policy_actions, noise.beam, settings.include_policy_action)
@@ -65,18 +65,22 @@ def short_horizon(
 ) -> Rollouts:
     """Evaluate ShortHorizon for every environment, candidate and simulation (Algorithm 1, lines 24 to 38).
 
-    All rollouts advance together. In a deterministic environment the simulations of a candidate are the same
+    All rollouts advance together. In a deterministic environment the simulations of a candidate are identical
     until their noise differs, so the forward model holds one row for all of them until then.
 
+    :param roots: where the rollouts start.
     :param candidates: ``[n_envs, beam, act_dim]``.
-    :param noise: of those candidates: 0 where one is the policy's own action.
+    :param functions: networks, discount and scales.
+    :param settings: depth and simulations.
+    :param noise: of those candidates; 0 for the policy's own action.
+    :param rng: given to a model with random dynamics.
     :return: the rollouts' values. NaN where a simulation was invalid.
     """
     model = roots.model
     assert model is not None, "a rollout needs a forward model"
     n_envs, beam, act_dim = candidates.shape
     n_sim = settings.distinct_simulations(model.deterministic)
-    # Which rollouts each row of the model stands for.
+    # The rollouts that each row of the model represents.
     rollouts = np.arange(n_envs * beam * n_sim).reshape(-1, n_sim if model.deterministic else 1)
     returns, alpha, simulated_steps = np.zeros(rollouts.size), 1.0, 0  # line 25
     model.set_roots(roots.states, rollouts[:, 0] // (beam * n_sim), rng)
@@ -116,15 +120,15 @@ def short_horizon(
 def held_noise(
     noise: Noise, settings: SearchSettings, depth: int, rollouts: np.ndarray, n_sim: int
 ) -> np.ndarray:
-    """Find the noise of the actions that follow a step: that of the macro-step that they are in.
+    """Select the noise of the actions after a step, from their macro-step.
 
-    :param noise: of the decision.
-    :param settings: say for how many steps noise is held.
+    :param noise: all noise of the decision.
+    :param settings: contain ``noise_hold``.
     :param depth: the step, counted from 1.
-    :param rollouts: ``[rows, simulations]``, the rollouts that each row stands for.
-    :param n_sim: simulations of a candidate.
+    :param rollouts: ``[rows, simulations]``, the rollouts that each row represents.
+    :param n_sim: simulations per candidate.
     :return: ``[rows, simulations, act_dim]``, or ``[rows, 1, act_dim]`` in the first macro-step, where all
-        simulations of a candidate hold its noise.
+        simulations of a candidate share its noise.
     """
     act_dim = noise.beam.shape[-1]
     if depth < settings.noise_hold:
@@ -141,8 +145,9 @@ def _of_first_simulations(step: Transition, n_sim: int) -> FirstStep:
 def choose(policy_actions: np.ndarray, rollouts: Rollouts) -> SearchResult:
     """Select the best candidates (Algorithm 1, line 15).
 
-    :param policy_actions: ``[n_envs, act_dim]``, what is done where no candidate is valid.
+    :param policy_actions: ``[n_envs, act_dim]``, executed where no candidate is valid.
     :param rollouts: of all candidates.
+    :return: actions and details of the search.
     """
     candidates, values, first_step, simulated_steps = rollouts
     means, invalid_rollouts = mean_values(values)
@@ -163,7 +168,7 @@ def mean_values(values: np.ndarray) -> tuple[np.ndarray, int]:
     """Average the simulations of each candidate (Algorithm 1, line 13).
 
     :param values: ``[n_envs, beam, sim]``, not finite where a simulation was invalid.
-    :return: Q~_i ``[n_envs, beam]``, -inf where a simulation was invalid, and how many were.
+    :return: Q~_i ``[n_envs, beam]``, -inf where a simulation was invalid, and the number of invalid ones.
     """
     finite = np.isfinite(values)
     invalid_rollouts = int(values.size - np.count_nonzero(finite))
@@ -174,10 +179,10 @@ def mean_values(values: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 def join_rounds(rounds: Sequence[Rollouts]) -> Rollouts:
-    """Put the candidates of several rounds next to one another.
+    """Concatenate the candidates of several rounds.
 
-    :param rounds: of the same environments.
-    :return: of all candidates.
+    :param rounds: rollouts of the same environments.
+    :return: the rollouts of all candidates.
     """
     n_envs = len(rounds[0].candidates)
 

@@ -1,9 +1,9 @@
-"""The cross-entropy method: rounds of plans around the best so far.
+"""The cross-entropy method: rounds of plans around the best plans so far.
 
-A candidate is a *plan*: what is added to the policy's action at each of the next ``rollout_depth`` steps,
-``a_t = clip(pi(s_t) + plan_t, -1, 1)``. Plans are rolled out as Algorithm 1 rolls out its candidates, only
-that the noise of later steps belongs to the plan. With ``noise_hold`` above 1 a plan has one offset for each
-macro-step, and axes of ``rollout_depth`` count those.
+A candidate is a *plan*: offsets to the policy's actions at the next ``rollout_depth`` steps,
+``a_t = clip(pi(s_t) + plan_t, -1, 1)``. Plans are rolled out like the candidates of Algorithm 1, but the
+noise of later steps belongs to the plan. With ``noise_hold`` above 1 a plan has one offset per macro-step,
+and axes of ``rollout_depth`` count macro-steps.
 """
 
 from collections.abc import Sequence
@@ -28,11 +28,11 @@ from sb3_mcbs.search.strategy_settings import CEMSettings
 
 
 class Plans(NamedTuple):
-    """What plans are drawn from: independent Gaussians.
+    """The distribution of plans: independent Gaussians.
 
     :param mean: ``[n_envs, rollout_depth, act_dim]``.
-    :param spread: ``[n_envs, rollout_depth, act_dim]``, standard deviations; with ``directions`` along those,
-        ``[n_envs, rollout_depth, proposal_dims]``.
+    :param spread: ``[n_envs, rollout_depth, act_dim]``, standard deviations; with ``directions``
+        ``[n_envs, rollout_depth, proposal_dims]``, along those.
     """
 
     mean: np.ndarray
@@ -40,13 +40,13 @@ class Plans(NamedTuple):
 
 
 def draw_plan_noise(rng: np.random.Generator, settings: CEMSettings, n_envs: int, act_dim: int) -> np.ndarray:
-    """Draw the noise of one decision, of all rounds at once.
+    """Draw the noise of one decision, for all rounds at once.
 
-    :param rng: generator of the search.
+    :param rng: draws the noise.
     :param settings: rounds, width and depth.
     :param n_envs: number of environments.
-    :param act_dim: entries of one action.
-    :return: ``[n_rounds, n_envs, proposals, rollout_depth, act_dim]``, of standard deviation 1.
+    :param act_dim: action dimensions.
+    :return: ``[n_rounds, n_envs, proposals, rollout_depth, act_dim]``, with standard deviation 1.
     """
     n_proposals = settings.n_proposals or settings.beam_width
     shape = (settings.n_rounds, n_envs, n_proposals, settings.rollout_depth, act_dim)
@@ -69,9 +69,9 @@ def cem_search(
     :param settings: rounds, width, depth, elites and spreads.
     :param noise: from :func:`draw_plan_noise`.
     :param rng: given to a model with random dynamics.
-    :param remembered: ``[n_envs, rollout_depth, act_dim]``, the plans to start around; 0 is the policy.
-    :param directions: ``[proposal_dims, act_dim]``, in which plans differ from their mean; ``None``: in all.
-    :return: actions, and what the search found, with the plans that the actions are from.
+    :param remembered: ``[n_envs, rollout_depth, act_dim]``, the mean of the first round; 0 is the policy.
+    :param directions: ``[proposal_dims, act_dim]``, in which plans differ from their mean; ``None``: all.
+    :return: actions and details of the search, including the chosen plans.
     """
     policy_actions = functions.policy(roots.observations)
     dims = remembered.shape[2] if directions is None else len(directions)
@@ -84,7 +84,7 @@ def cem_search(
             values = np.concatenate([each.values for each in rounds], axis=1)
             source = refit(source, np.concatenate(plans, axis=1), values, settings, beginning, directions)
         offsets = combine(round_noise[..., :dims] * source.spread[:, None], directions)
-        # The whole plan is clipped: rounds and decisions would otherwise carry its mean ever further.
+        # The whole plan is clipped, or its mean would drift over rounds and decisions.
         drawn = scale(source.mean[:, None] + offsets, 1.0, settings)
         always = _put_first(drawn, source.mean, settings.include_policy_action and number == 0)
         proposed, _ = propose(policy_actions, drawn[:, :, 0], include_policy_action=False)
@@ -122,11 +122,11 @@ def refit(
 ) -> Plans:
     """Fit the Gaussians to the best plans so far.
 
-    :param source: what the last round was drawn from; stays where no plan was valid.
-    :param plans: ``[n_envs, candidates, rollout_depth, act_dim]``, of all rounds until now.
-    :param values: ``[n_envs, candidates, sim]``, theirs.
-    :param settings: the number of elites, and the floor of the spread.
-    :param beginning: ``[rollout_depth, 1]``, standard deviations of the first round; caps the floor.
+    :param source: the last round's distribution; kept where no plan was valid.
+    :param plans: ``[n_envs, candidates, rollout_depth, act_dim]``, of all rounds so far.
+    :param values: ``[n_envs, candidates, sim]``, the plans' values.
+    :param settings: the number of elites, and the lower bound of the spread.
+    :param beginning: ``[rollout_depth, 1]``, standard deviations of the first round; limits the lower bound.
     :param directions: ``[proposal_dims, act_dim]``; ``None``: all.
     :return: mean and standard deviation of the elites.
     """
@@ -147,9 +147,9 @@ def refit(
 
 
 def _put_first(drawn: np.ndarray, mean: np.ndarray, with_policy: bool) -> int:
-    """Make the mean the first plan and, where that is another one, the policy alone the second.
+    """Make the mean the first plan and, where that differs, the policy alone the second.
 
-    :return: how many plans were given a place.
+    :return: the number of first plans that pre-selection always keeps.
     """
     drawn[:, 0] = mean
     if with_policy:
@@ -158,7 +158,7 @@ def _put_first(drawn: np.ndarray, mean: np.ndarray, with_policy: bool) -> int:
 
 
 def _as_noise(plans: np.ndarray, n_simulations: int) -> Noise:
-    """Plans as the noise of rollouts; the action that closes a rollout is the policy's own."""
+    """Plans as the noise of rollouts; the bootstrap uses the policy's own action."""
     later = np.concatenate([plans[:, :, 1:], np.zeros_like(plans[:, :, :1])], axis=2)
     by_depth = np.moveaxis(later, 2, 0)[:, :, :, None]
     shape = (*by_depth.shape[:3], n_simulations, by_depth.shape[4])
@@ -204,8 +204,8 @@ class WarmStart:
         """Remember the plans of a decision.
 
         :param plans: ``[len(envs), rollout_depth, act_dim]``, by macro-steps.
-        :param envs: the environments that decided.
-        :param now: the present moment of each.
+        :param envs: indices of the environments.
+        :param now: the current episode clock of each.
         """
         by_step = np.repeat(plans, self._plans.shape[1] // plans.shape[1], axis=1)
         for plan, env, moment in zip(by_step, envs, now, strict=True):
@@ -221,18 +221,18 @@ class WarmStart:
         ]
 
     def state(self, now: Sequence[EpisodeClock]) -> dict[str, Any]:
-        """What :meth:`set_state` takes, as plain values that do not depend on how often was reset.
+        """The state for :meth:`set_state`, as plain values that do not depend on the number of resets.
 
-        :param now: the present moment of every environment.
-        :return: the plans, and their ages.
+        :param now: the current episode clock of every environment.
+        :return: the plans and their ages.
         """
         return {"plans": self._plans.copy(), "ages": self._ages(range(len(now)), now)}
 
     def set_state(self, state: dict[str, Any], now: Sequence[EpisodeClock]) -> None:
-        """Remember what another memory did.
+        """Restore a state.
 
         :param state: from :meth:`state`.
-        :param now: the present moment of every environment, which are in the states of then.
+        :param now: the current episode clock of every environment, each in its state at that time.
         """
         self._plans[:] = state["plans"]
         self._episode_clocks = [

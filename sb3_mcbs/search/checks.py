@@ -1,4 +1,4 @@
-"""Settings that check themselves, and name the one that is wrong."""
+"""Settings that check their values and name the invalid one."""
 
 import math
 from collections.abc import Collection, Mapping
@@ -9,19 +9,19 @@ from typing import Any, ClassVar, Self
 
 @dataclass(frozen=True)
 class CheckedSettings:
-    """What groups of settings share: checks of one value, and the form in which agents have them.
+    """Base of groups of settings: checks of single values, and conversion to an agent's attributes.
 
     Some fields are keywords of an agent's constructor and attributes of the agent (``beam_width``), the
-    others are keys of a dictionary that is one (``search_kwargs``).
+    others are keys of a dictionary (``search_kwargs``).
     """
 
-    #: The name of that dictionary, and of the fields that are keywords themselves.
+    #: The name of that dictionary, and of the fields that are keywords.
     group: ClassVar[str] = ""
     flat: ClassVar[tuple[str, ...]] = ()
 
     def _check_name(self, setting: str, known: tuple[str, ...], *others: str) -> None:
         value = getattr(self, setting)
-        # Names are compared as strings only: an array, say, has no answer to whether it is in a tuple.
+        # Only strings are compared: arrays, for example, cannot be searched for in a tuple.
         if not isinstance(value, str) or value not in known:
             allowed = " or ".join([str(known), *others])
             raise ValueError(f"{setting} must be one of {allowed}, got {value!r}.")
@@ -32,7 +32,7 @@ class CheckedSettings:
             raise TypeError(f"{name} must be an integer, got {value!r}.")
         if not low <= int(value) <= high:
             raise ValueError(f"{name} must be between {low} and {high}, got {value}.")
-        # NumPy's integers have few bits, and products of settings overflow.
+        # Products of NumPy integers could overflow.
         object.__setattr__(self, name, int(value))
 
     def _set_number(self, name: str, high: float) -> None:
@@ -43,7 +43,7 @@ class CheckedSettings:
             number = float(value)
         except OverflowError:
             number = math.inf
-        # NaN is not between anything.
+        # Also refuses NaN.
         if not 0 <= number <= high:
             raise ValueError(f"{name} must be finite, not negative and at most {high:g}, got {value}.")
         object.__setattr__(self, name, number)
@@ -55,21 +55,21 @@ class CheckedSettings:
 
     @classmethod
     def names(cls) -> tuple[str, ...]:
-        """Names of all settings, in the order of the constructor."""
+        """Names of all settings, in the constructor's order."""
         return tuple(field.name for field in fields(cls))
 
     @classmethod
     def in_group(cls) -> tuple[str, ...]:
-        """What :attr:`group` may contain."""
+        """The keys of :attr:`group`."""
         return tuple(name for name in cls.names() if name not in cls.flat)
 
     @classmethod
     def of(cls, agent: Any) -> Self:
-        """Read the settings that an agent carries as attributes.
+        """Read the settings from an agent's attributes.
 
-        :param agent: an object that has settings as attributes, such as ``MCBSTD3``.
+        :param agent: an object with settings as attributes, such as ``MCBSTD3``.
         :return: the checked settings.
-        :raises TypeError: if a value has the wrong type, or a key is not known.
+        :raises TypeError: if a value has the wrong type, or a key is unknown.
         """
         values = {name: getattr(agent, name) for name in cls.flat}
         if cls.group:
@@ -78,7 +78,7 @@ class CheckedSettings:
         return cls(**values)
 
     def grouped(self) -> dict[str, Any]:
-        """The settings as an agent has them: by name, and in a dictionary what is not at its default."""
+        """The settings as attributes of an agent; the dictionary lists what differs from the defaults."""
         values: dict[str, Any] = {name: getattr(self, name) for name in self.flat}
         if self.group:
             changed = {f.name for f in fields(self) if getattr(self, f.name) != f.default}
@@ -94,11 +94,11 @@ def known_keys(
 
     :param group: its name, such as ``search_kwargs``.
     :param given: the dictionary; ``None`` is an empty one.
-    :param known: what it may contain.
-    :param chosen: the choice that it goes with, such as ``strategy='beam'``.
-    :param others: what to say of other keys.
+    :param known: the valid keys.
+    :param chosen: the choice that it belongs to, such as ``strategy='beam'``.
+    :param others: explanations of other keys for the error.
     :return: a copy.
-    :raises TypeError: if it is no dictionary, or names a key that is not known.
+    :raises TypeError: if it is not a dictionary, or contains an unknown key.
     """
     given = as_dict(group, given)
     for key in given:
@@ -113,7 +113,7 @@ def as_dict(group: str, given: Any) -> dict[str, Any]:
 
     :param group: its name, such as ``search_kwargs``.
     :param given: the dictionary; ``None`` is an empty one.
-    :raises TypeError: if it is neither.
+    :raises TypeError: for anything else.
     """
     if given is not None and not isinstance(given, Mapping):
         raise TypeError(f"{group} must be a dictionary or None, got {given!r}.")

@@ -1,4 +1,4 @@
-"""Search until a deadline: rounds of candidates are added while the next is expected to finish in time."""
+"""Search until a deadline: adds rounds of candidates while the next is expected to finish in time."""
 
 import time
 from collections import deque
@@ -20,17 +20,17 @@ from sb3_mcbs.search.proposals import draw_noise, propose
 from sb3_mcbs.search.strategy_settings import BeamSettings
 from sb3_mcbs.types import ForwardModel, Transition
 
-#: How many past durations a forecast looks at, and which share of them it covers: of rounds, and of single
-#: steps, which are what makes a decision late.
+#: Number of past durations in a forecast, and the quantiles for rounds and for single steps, which make
+#: decisions late.
 _MEMORY, _SHARE_OF_ROUNDS, _SHARE_OF_STEPS = 64, 0.75, 0.95
-#: So many durations must be known before anything is refused because of them: the first ones are slow.
+#: Known durations before a forecast may skip anything: the first ones are slow.
 _WARM_UP = 10
-#: Factors of a forecast each time that something was not done because of it: the machine may be quicker now.
+#: Factors applied to a forecast each time it skips something: the machine may be faster now.
 _RELAX_ROUND, _RELAX_STEP = 0.99, 0.98
 
 
 class _Durations:
-    """The last durations of something that is done again and again."""
+    """The last durations of a repeated operation."""
 
     def __init__(self) -> None:
         self._last: deque[float] = deque(maxlen=_MEMORY)
@@ -39,22 +39,22 @@ class _Durations:
         self._last.append(seconds)
 
     def relax(self, factor: float) -> None:
-        """Make the forecast less strict: what is not done any more cannot be learned again."""
+        """Lower the forecast, since skipped operations are not measured again."""
         self._last = deque((factor * seconds for seconds in self._last), maxlen=_MEMORY)
 
     def forecast(self, share: float) -> float:
-        """What that share of the durations did not exceed; 0 if there are none yet."""
+        """The quantile of the durations; 0 if there are none yet."""
         return sorted(self._last)[int(share * (len(self._last) - 1) + 0.5)] if self._last else 0.0
 
     def known(self) -> bool:
-        """Whether there are enough to refuse something because of them."""
+        """Whether there are enough durations to skip something."""
         return len(self._last) >= _WARM_UP
 
 
 class LatencyForecast:
-    """Forecasts how long rounds take, from those that were done.
+    """Forecasts how long rounds take, from earlier ones.
 
-    :param clock: seconds, rising.
+    :param clock: returns monotonic seconds.
     """
 
     def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
@@ -64,10 +64,10 @@ class LatencyForecast:
         self.ending = _Durations()
 
     def note_round(self, width: int, seconds: float) -> None:
-        """Learn from a round.
+        """Record a round.
 
-        :param width: its candidates.
-        :param seconds: what it took, or would have taken at least if it had not been given up.
+        :param width: number of candidates.
+        :param seconds: its duration, or a lower bound if it was abandoned.
         """
         self._rounds.setdefault(width, _Durations()).note(seconds)
 
@@ -78,14 +78,14 @@ class LatencyForecast:
     def of_round(self, width: int) -> float | None:
         """Seconds that a round will probably not exceed.
 
-        :param width: its candidates.
-        :return: ``None`` if no round was done yet.
+        :param width: number of candidates.
+        :return: ``None`` before the first round.
         """
         if width in self._rounds:
             return self._rounds[width].forecast(_SHARE_OF_ROUNDS)
         if not self._rounds:
             return None
-        # A round has fixed costs, so that n times the candidates take less than n times as long.
+        # A round has fixed costs, so n times the candidates take less than n times as long.
         narrower = [known for known in self._rounds if known < width]
         nearest = max(narrower) if narrower else min(self._rounds)
         return self._rounds[nearest].forecast(_SHARE_OF_ROUNDS) * max(1.0, width / nearest)
@@ -93,10 +93,10 @@ class LatencyForecast:
     def affordable(self, seconds: float, most: int) -> int:
         """The number of candidates for the next round.
 
-        A round that is given up is lost, so none but the narrowest takes more than half of the time left.
+        An abandoned round is lost, so only the narrowest may take more than half of the remaining time.
 
-        :param seconds: time left.
-        :param most: candidates that are still wanted.
+        :param seconds: remaining time.
+        :param most: number of remaining candidates.
         :return: a power of two or ``most``; 0 if not even one candidate is expected to finish.
         """
         seconds -= self.ending.forecast(_SHARE_OF_STEPS)
@@ -117,18 +117,18 @@ class LatencyForecast:
 
 
 class OutOfTimeError(Exception):
-    """A round was given up before its rollouts were finished."""
+    """A round was abandoned before its rollouts were finished."""
 
 
 class _WatchedModel(ForwardModel):
-    """A forward model that gives a round up before a step that would be late, and learns how long steps take.
+    """A forward model that abandons a round before a step that would be late, and measures steps.
 
     :param model: simulates.
-    :param pace: what is known of durations.
+    :param pace: forecasts durations.
     :param width: candidates of the round.
     :param deadline: on the clock of ``pace``.
 
-    :ivar simulated_steps: until now.
+    :ivar simulated_steps: steps so far.
     """
 
     def __init__(self, model: ForwardModel, pace: LatencyForecast, width: int, deadline: float) -> None:
@@ -161,7 +161,7 @@ class _WatchedModel(ForwardModel):
         return self._model.step(actions)
 
     def finish(self) -> None:
-        """The round is finished."""
+        """Record the finished round."""
         now = self._pace.clock()
         self._record_duration(now)
         self._pace.note_round(self._width, now - self._start)
@@ -194,17 +194,17 @@ def deadline_search(
 ) -> SearchResult:
     """Choose one action per environment from as many candidates as there is time for.
 
-    A round takes some candidates through all depths. Only finished rounds count; if there is none, the
-    policy's own action is taken. The result depends on how fast the machine was.
+    A round rolls some candidates out to the full depth. Only finished rounds count; if there is none, the
+    policy's own action is executed. The result depends on the machine's speed.
 
     :param roots: where the rollouts start.
     :param functions: networks, discount and scales.
-    :param settings: depth, simulations, noise, and the number of candidates that is enough.
-    :param deadline: when to be done, on the clock of ``pace``.
-    :param pace: forecasts of this search, kept from decision to decision.
-    :param rng: of the search: draws the noise, and is given to a model with random dynamics.
-    :param directions: ``[proposal_dims, act_dim]``, in which candidates differ; ``None``: in all.
-    :return: actions, and what the search found.
+    :param settings: depth, simulations, noise, and the largest number of candidates.
+    :param deadline: latest end, on the clock of ``pace``.
+    :param pace: forecasts of this search, kept between decisions.
+    :param rng: draws the noise, and is given to a model with random dynamics.
+    :param directions: ``[proposal_dims, act_dim]``, in which candidates differ; ``None``: all.
+    :return: actions and details of the search.
     """
     assert roots.model is not None
     policy_actions = functions.policy(roots.observations)

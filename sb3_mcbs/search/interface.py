@@ -1,7 +1,7 @@
-"""What goes into a search and what comes out, whatever the strategy.
+"""Inputs and outputs of a search, for all strategies.
 
-Arrays in, arrays out. Actions are scaled to [-1, 1] here, as a policy network gives them.
-Axes: ``n_envs`` environments, ``beam`` candidates, ``sim`` simulations, ``act_dim`` action entries.
+Arrays in, arrays out. Actions are scaled to [-1, 1], as a policy network returns them.
+Axes: ``n_envs`` environments, ``beam`` candidates, ``sim`` simulations, ``act_dim`` action dimensions.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,11 +13,11 @@ from sb3_mcbs.types import ForwardModel, Observations, Transition, take_rows
 
 
 class Roots(NamedTuple):
-    """Where a search starts: the present states of the environments.
+    """Where a search starts: the current states of the environments.
 
     :param model: simulates from these states; ``None`` if ``rollout_depth`` is 0.
     :param states: one per environment, from :meth:`ForwardModel.read_roots`.
-    :param observations: ``[n_envs, *obs_shape]``, present observations.
+    :param observations: ``[n_envs, *obs_shape]``, current observations.
     """
 
     model: ForwardModel | None
@@ -26,16 +26,16 @@ class Roots(NamedTuple):
 
 
 class PolicyFunctions(NamedTuple):
-    """What a search has to know of the agent.
+    """The agent's networks and settings, as a search uses them.
 
     :param policy: observations ``[rows, ...]`` -> actions ``[rows, act_dim]`` in [-1, 1], without
         exploration noise.
     :param value: observations ``[rows, ...]``, scaled actions ``[rows, act_dim]`` -> the critics'
-        estimate of the return ``[rows]``, already the minimum over the critics.
+        estimate of the return ``[rows]``: their minimum, or TQC's mean over all quantiles.
     :param gamma: discount factor per environment step.
     :param unscale_action: scaled actions ``[rows, act_dim]`` -> actions of the environment.
-    :param scale_reward: rewards of the environment ``[rows]`` -> the scale that the critics know.
-    :param act_dim: entries of one action.
+    :param scale_reward: rewards of the environment ``[rows]`` -> the critics' scale.
+    :param act_dim: action dimensions.
     """
 
     policy: Callable[[Observations], np.ndarray]
@@ -47,11 +47,11 @@ class PolicyFunctions(NamedTuple):
 
 
 class CountedValue:
-    """The critics, and how often they were asked.
+    """The critics with a counter.
 
     :param value: see :class:`PolicyFunctions`.
 
-    :ivar evaluations: pairs of an observation and an action that were valued.
+    :ivar evaluations: number of evaluated state-action pairs.
     """
 
     def __init__(self, value: Callable[[Observations, np.ndarray], np.ndarray]) -> None:
@@ -64,10 +64,10 @@ class CountedValue:
 
 
 class FirstStep(NamedTuple):
-    """What the forward model says that the chosen actions will do.
+    """The forward model's prediction for the chosen actions.
 
     :param observations: ``[n_envs, *obs_shape]``.
-    :param rewards: ``[n_envs]``, of the environment.
+    :param rewards: ``[n_envs]``, not scaled.
     """
 
     observations: Observations
@@ -75,7 +75,7 @@ class FirstStep(NamedTuple):
 
 
 class Rollouts(NamedTuple):
-    """Candidates, and what their rollouts gave.
+    """Candidates and the results of their rollouts.
 
     :param candidates: ``[n_envs, beam, act_dim]``.
     :param values: ``[n_envs, beam, sim]`` in float64, not finite where a simulation was invalid.
@@ -93,21 +93,21 @@ class SearchResult(NamedTuple):
     """The outcome of one decision in every environment.
 
     :param actions: ``[n_envs, act_dim]``, the actions to execute, scaled.
-    :param chosen: ``[n_envs]``, which candidate that is; -1 where every candidate was invalid and the
-        policy's own action was taken.
-    :param candidates: ``[n_envs, beam, act_dim]``, all that were simulated: of a tree the root actions, of a
-        cross-entropy method the first actions of all its rounds.
+    :param chosen: ``[n_envs]``, indices of the chosen candidates; -1 where every candidate was invalid and
+        the policy's own action was taken.
+    :param candidates: ``[n_envs, beam, act_dim]``, all simulated ones: the root actions of a tree, the first
+        actions of all rounds of the cross-entropy method.
     :param values: ``[n_envs, beam]``, Q~_i; -inf where a simulation of the candidate was invalid. In a tree
-        a root action that was dropped keeps the value with which it was dropped.
+        a dropped root action keeps its last value.
     :param first_step: the chosen candidates' first simulated step (of their first simulation);
         ``None`` if nothing was simulated. Meaningless where ``chosen`` is -1.
     :param simulated_steps: environment steps that were simulated, each counted once.
     :param invalid_rollouts: rollouts that diverged or whose value is not finite.
-    :param rounds: finished rounds: 1, or any number if the search had a time budget, or ``n_rounds``.
-    :param critic_evaluations: observations with an action that the critics rated.
-    :param surviving_roots: of a tree: ``[n_envs]``, how many root actions still had a node at the end.
-    :param plans: of the cross-entropy method: ``[n_envs, rollout_depth, act_dim]``, what the
-        actions are from; 0 where none was valid.
+    :param rounds: finished rounds: 1, ``n_rounds``, or any number with a time budget.
+    :param critic_evaluations: state-action pairs that the critics evaluated.
+    :param surviving_roots: ``[n_envs]``, for a tree: number of root actions with a node at the end.
+    :param plans: ``[n_envs, rollout_depth, act_dim]``, for the cross-entropy method: the chosen plans; 0
+        where none was valid.
     """
 
     actions: np.ndarray
@@ -124,10 +124,10 @@ class SearchResult(NamedTuple):
 
 
 def policy_alone(policy_actions: np.ndarray, simulated_steps: int = 0) -> SearchResult:
-    """The outcome where no candidate was evaluated.
+    """The result if no candidate was evaluated.
 
     :param policy_actions: ``[n_envs, act_dim]``, to be executed.
-    :param simulated_steps: what was simulated in vain.
+    :param simulated_steps: steps of an abandoned round.
     """
     n_envs, act_dim = policy_actions.shape
     return SearchResult(
@@ -143,11 +143,11 @@ def policy_alone(policy_actions: np.ndarray, simulated_steps: int = 0) -> Search
 
 
 def stopped_values(step: Transition, functions: PolicyFunctions) -> tuple[np.ndarray, np.ndarray]:
-    """Value the rows of a step whose episode the environment itself truncated.
+    """Bootstrap rows whose episode the environment itself truncated.
 
     :param step: ``[rows]``, with ``stopped``.
-    :param functions: its critics value what its policy would do there.
-    :return: which rows ``[n]``, and their values ``[n]`` in float64.
+    :param functions: the policy and the critics.
+    :return: indices of those rows ``[n]``, and their values ``[n]`` in float64.
     """
     assert step.stopped is not None
     rows = np.flatnonzero(step.stopped & step.valid & ~step.terminated)

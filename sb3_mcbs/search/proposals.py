@@ -1,7 +1,7 @@
-"""Where candidates come from: noise around the policy's actions, and the critics' first look at them.
+"""Proposes candidates: noise around the policy's actions, and pre-selection by the critics.
 
-All random numbers of a decision are drawn before anything is simulated, as float32 and in a fixed order,
-so that they do not depend on what the simulations give.
+All random numbers of a decision are drawn before the simulation, as float32 and in a fixed order, so they do
+not depend on the simulation's results.
 """
 
 from typing import Any, NamedTuple
@@ -21,9 +21,9 @@ _NEGLIGIBLE = 1e-6
 class Noise(NamedTuple):
     """All random numbers of one decision by Algorithm 1.
 
-    :param beam: ``[n_envs, proposals, act_dim]``, eta_i in Algorithm 1; that of the first macro-step.
-    :param rollout: ``[rollout_depth, n_envs, beam, sim, act_dim]``, eta in ShortHorizon; that of the later
-        macro-steps and of the action that closes the rollout.
+    :param beam: ``[n_envs, proposals, act_dim]``, eta_i in Algorithm 1, for the first macro-step.
+    :param rollout: ``[rollout_depth, n_envs, beam, sim, act_dim]``, eta in ShortHorizon, for the later
+        macro-steps and the action of the bootstrap.
     """
 
     beam: np.ndarray
@@ -38,14 +38,14 @@ def draw_noise(
     beam_width: int | None = None,
     directions: np.ndarray | None = None,
 ) -> Noise:
-    """Draw the noise of one decision: first that of the candidates, then that of the rollouts.
+    """Draw the noise of one decision: first for the candidates, then for the rollouts.
 
-    :param rng: generator of the search.
-    :param settings: width, depth, simulations, noise scales, and how draws depend on one another.
+    :param rng: draws the noise.
+    :param settings: width, depth, simulations, noise scales and ``antithetic``.
     :param n_envs: number of environments.
-    :param act_dim: entries of one action.
-    :param beam_width: candidates; ``None``: as many as the settings say.
-    :param directions: ``[proposal_dims, act_dim]``, in which candidates differ; ``None``: in all.
+    :param act_dim: action dimensions.
+    :param beam_width: number of candidates; ``None``: that of the settings.
+    :param directions: ``[proposal_dims, act_dim]``, in which candidates differ; ``None``: all.
     :return: the noise, clipped to ``noise_clip`` if that is set.
     """
     b, d, n = beam_width or settings.beam_width, settings.rollout_depth, settings.n_simulations
@@ -62,12 +62,12 @@ def draw_normal(rng: np.random.Generator, shape: tuple[int, ...], pairs: int | N
     """Draw Gaussian noise, or antithetic pairs of it.
 
     With pairs the second half along their axis is minus the first half, and with an odd number the first
-    one is 0, so that the sum is 0 always. A single one stays as it was drawn.
+    draw is 0, so the sum is always 0. A single draw is unchanged.
 
-    :param rng: generator of the search.
-    :param shape: of the noise.
-    :param pairs: along which axis there are pairs; ``None``: all draws are independent.
-    :return: float32 of that shape, of standard deviation 1.
+    :param rng: draws the noise.
+    :param shape: shape of the noise.
+    :param pairs: axis of the pairs; ``None``: all draws are independent.
+    :return: float32 noise with standard deviation 1.
     """
     if pairs is None or shape[pairs] < 2:
         return rng.standard_normal(shape, dtype=np.float32)
@@ -81,11 +81,11 @@ def draw_normal(rng: np.random.Generator, shape: tuple[int, ...], pairs: int | N
 
 
 def scale(noise: np.ndarray, spread: float | np.ndarray, settings: SearchSettings) -> np.ndarray:
-    """Give noise its standard deviation, and clip it to ``noise_clip`` if that is set.
+    """Scale noise to a standard deviation, and clip it to ``noise_clip`` if that is set.
 
-    :param noise: of standard deviation 1.
-    :param spread: standard deviations, one for all or an array that fits.
-    :param settings: of the search.
+    :param noise: noise with standard deviation 1.
+    :param spread: standard deviation, or an array that broadcasts.
+    :param settings: contain ``noise_clip``.
     :return: the noise in the action space scaled to [-1, 1].
     """
     noise = noise * np.asarray(spread, dtype=np.float32)
@@ -102,7 +102,7 @@ def propose(
     :param policy_actions: ``[n_envs, act_dim]``.
     :param noise: ``[n_envs, beam, act_dim]``.
     :param include_policy_action: whether the first candidate has no noise.
-    :return: candidates ``[n_envs, beam, act_dim]`` in [-1, 1], and the noise in them.
+    :return: candidates ``[n_envs, beam, act_dim]`` in [-1, 1], and their noise.
     """
     candidates = clip_actions(policy_actions[:, None] + noise)
     if include_policy_action:
@@ -115,9 +115,9 @@ def preselect(values: np.ndarray, keep: int, always: int) -> np.ndarray:
     """Find the actions that the critics value most.
 
     :param values: ``[n, proposals]``, from :func:`critic_values`.
-    :param keep: how many are kept.
-    :param always: how many of the first are kept whatever the critics say.
-    :return: ``[n, keep]``, places among the proposals, rising.
+    :param keep: number of actions to keep.
+    :param always: number of first actions that are always kept.
+    :return: ``[n, keep]``, indices of proposals, ascending.
     """
     values = np.where(np.isfinite(values), values, -np.inf)
     values[:, :always] = np.inf
@@ -125,11 +125,11 @@ def preselect(values: np.ndarray, keep: int, always: int) -> np.ndarray:
 
 
 def best(values: np.ndarray, keep: int) -> np.ndarray:
-    """Find the highest values, of equal ones the first.
+    """Find the highest values; of equal ones the first.
 
     :param values: ``[n, candidates]``.
-    :param keep: how many.
-    :return: ``[n, keep]``, their places, rising.
+    :param keep: number of values to keep.
+    :return: ``[n, keep]``, their indices, ascending.
     """
     return np.sort(np.argsort(-values, axis=1, kind="stable")[:, :keep], axis=1)
 
@@ -151,9 +151,9 @@ def critic_values(
 
 
 def clip_actions(actions: np.ndarray) -> np.ndarray:
-    """Clip to [-1, 1] in place; two ufuncs are quicker than ``np.clip``.
+    """Clip to [-1, 1] in place; two ufuncs are faster than ``np.clip``.
 
-    :param actions: any shape.
+    :param actions: array of any shape.
     :return: the same array.
     """
     return np.maximum(np.minimum(actions, 1, out=actions), -1, out=actions)
@@ -173,7 +173,7 @@ class RecentActions:
         return min(self._count, RECENT)
 
     def note(self, actions: np.ndarray) -> None:
-        """Remember actions in place of the oldest ones.
+        """Store actions in place of the oldest ones.
 
         :param actions: ``[n, act_dim]``, scaled, as executed.
         """
@@ -184,9 +184,9 @@ class RecentActions:
     def directions(self, n_directions: int) -> np.ndarray | None:
         """Find the principal directions: those in which the actions vary most around their mean.
 
-        :param n_directions: how many.
+        :param n_directions: number of directions.
         :return: ``[n_directions, act_dim]``, orthonormal; ``None`` while fewer than ``ENOUGH`` actions are
-            known, or if they vary in fewer directions than that.
+            known, or if they vary in fewer directions.
         """
         if len(self) < ENOUGH:
             return None
@@ -198,11 +198,11 @@ class RecentActions:
         return axes[:, ::-1][:, :n_directions].T.astype(np.float32)
 
     def state(self) -> dict[str, Any]:
-        """What :meth:`set_state` takes, as plain values."""
+        """The state for :meth:`set_state`, as plain values."""
         return {"actions": self._actions.copy(), "count": self._count}
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Remember what another memory did.
+        """Restore a state.
 
         :param state: from :meth:`state`.
         """
@@ -211,7 +211,7 @@ class RecentActions:
 
 
 def gain(directions: np.ndarray | None) -> float:
-    """What noise along directions is multiplied by, so that its total variance is that in all directions.
+    """The factor that gives noise along directions the total variance of noise in all directions.
 
     :param directions: ``[n_directions, act_dim]``, orthonormal; ``None`` is all.
     """
@@ -221,18 +221,18 @@ def gain(directions: np.ndarray | None) -> float:
 def combine(coordinates: np.ndarray, directions: np.ndarray | None) -> np.ndarray:
     """Turn coordinates along directions into actions.
 
-    :param coordinates: ``[..., act_dim]``, of which only the first ``n_directions`` count.
-    :param directions: ``[n_directions, act_dim]``; ``None``: coordinates are the entries of actions.
+    :param coordinates: ``[..., act_dim]``, of which only the first ``n_directions`` are used.
+    :param directions: ``[n_directions, act_dim]``; ``None``: coordinates are actions already.
     :return: ``[..., act_dim]``.
     """
     return coordinates if directions is None else coordinates[..., : len(directions)] @ directions
 
 
 def low_dimensional(noise: np.ndarray, directions: np.ndarray | None) -> np.ndarray:
-    """Turn noise in all directions into noise in some, of the same total variance.
+    """Turn noise in all directions into noise in some, with the same total variance.
 
     :param noise: ``[..., act_dim]``, independent entries of equal standard deviation.
-    :param directions: ``[n_directions, act_dim]``, orthonormal; ``None`` leaves it as it is.
+    :param directions: ``[n_directions, act_dim]``, orthonormal; ``None`` leaves it unchanged.
     :return: ``[..., act_dim]``.
     """
     return noise if directions is None else combine(noise, np.float32(gain(directions)) * directions)

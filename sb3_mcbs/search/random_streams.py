@@ -1,4 +1,4 @@
-"""Random numbers of one seed that have nothing to do with one another."""
+"""Independent random generators from one seed."""
 
 from typing import Literal, get_args
 
@@ -8,12 +8,12 @@ Purpose = Literal["schedule", "value expansion", "learned model"]
 
 
 def spawn_rng(seed: int | None, purpose: Purpose) -> np.random.Generator:
-    """Make a generator that has nothing in common with an environment of this seed, or with another purpose.
+    """Make a generator that is independent of an environment with this seed, and of other purposes.
 
-    ``np.random.default_rng(seed)`` is the generator of an environment that was reset with that seed: a
-    schedule that drew from a second one could search exactly where the environment is about to be kind.
+    An environment that is reset with a seed uses ``np.random.default_rng(seed)``. A schedule with the same
+    generator would be correlated with the environment.
 
     :param seed: ``None``: not reproducible.
-    :param purpose: what it is for.
+    :param purpose: selects the generator.
     """
     return np.random.default_rng(None if seed is None else [seed, 1 + get_args(Purpose).index(purpose)])

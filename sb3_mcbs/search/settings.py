@@ -1,4 +1,4 @@
-"""The settings of a search, checked once and then immutable: what all strategies share, and presets."""
+"""Settings of a search, checked once and then immutable: those of all strategies, and presets."""
 
 import functools
 import math
@@ -11,25 +11,25 @@ from typing import Any, ClassVar, Self
 from sb3_mcbs.search.checks import CheckedSettings, as_dict, known_keys
 from sb3_mcbs.types import BACKENDS
 
-#: More rollouts than this per environment are a mistake, not a search: memory would run out.
+#: Rollouts per decision and environment; more would exhaust the memory.
 MAX_ROLLOUTS = 100_000
 MAX_DEPTH = 10_000
-#: Steps of one decision and environment: the noise of all of them is drawn at once.
+#: Steps per decision and environment, whose noise is drawn at once.
 MAX_STEPS = 10_000_000
-#: Anything above clips every action to a corner, and float32 must be able to hold it.
+#: Larger noise clips every action to a corner, and may not fit float32.
 MAX_NOISE = 1e6
 MAX_THREADS = 1024
 MATMUL_PRECISIONS = ("highest", "high", "medium")
-#: The settings' class of each strategy, as defined in :mod:`~sb3_mcbs.search.strategy_settings`.
+#: The settings class of each strategy, see :mod:`~sb3_mcbs.search.strategy_settings`.
 STRATEGIES: dict[str, type["SearchSettings"]] = {}
-#: Settings of how, not of what, is computed: no preset or trial is about them.
+#: Settings of the machine, which presets leave alone.
 OF_THE_MACHINE = ("forward_model", "model_kwargs", "matmul_precision")
 
 
 @dataclass(frozen=True)
 class SearchSettings(CheckedSettings, ABC):
-    """What the settings of all strategies share: :class:`BeamSettings`, :class:`TreeSettings` and
-    :class:`CEMSettings`.
+    """Abstract base of :class:`BeamSettings`, :class:`TreeSettings` and :class:`CEMSettings`: the settings of
+    all strategies.
 
     Agents have ``beam_width``, ``rollout_depth``, ``n_simulations``, ``beam_noise``, ``forward_model`` and
     ``matmul_precision`` as keywords, ``n_threads`` in ``model_kwargs`` and all others in ``search_kwargs``.
@@ -38,29 +38,29 @@ class SearchSettings(CheckedSettings, ABC):
     :param rollout_depth: simulated steps per rollout (``D``), macro-steps if ``noise_hold`` is above 1. 0
         ranks the candidates by the critics alone: nothing is simulated and no snapshot is needed.
     :param n_simulations: rollouts per candidate (``N_sim``).
-    :param beam_noise: standard deviation of the Gaussian noise that makes candidates of the policy's
-        action (``sigma_b``), in the action space scaled to [-1, 1].
-    :param rollout_noise: the same for the later actions of a rollout. ``None``: as ``beam_noise``.
-    :param noise_clip: noise (of the cross-entropy method: what its plans add to the policy's actions) is
-        clipped to [-noise_clip, noise_clip]. ``None``: not clipped, as in the paper's Algorithm 1.
-    :param include_policy_action: whether the policy's own action takes the place of the first
-        candidate. ``False``, as in the paper, makes all candidates noisy.
-    :param n_proposals: actions that are drawn, of which the critics choose those that are simulated.
-        ``None``: all that are drawn are simulated.
-    :param antithetic: whether noise comes in pairs of opposite sign, of candidates and of the simulations of
-        one candidate.
+    :param beam_noise: standard deviation of the Gaussian noise that is added to the policy's action
+        (``sigma_b``), in the action space scaled to [-1, 1].
+    :param rollout_noise: the same for the later actions of a rollout. ``None``: ``beam_noise``.
+    :param noise_clip: noise (for the cross-entropy method: the whole plan) is clipped to
+        [-noise_clip, noise_clip]. ``None``: not clipped, as in the paper's Algorithm 1.
+    :param include_policy_action: whether the policy's own action replaces the first candidate. ``False``, as
+        in the paper, adds noise to all candidates.
+    :param n_proposals: number of sampled actions, of which the critics choose those to simulate. ``None``:
+        all are simulated.
+    :param antithetic: whether noise comes in pairs of opposite sign, for candidates and for the simulations
+        of a candidate.
     :param noise_hold: environment steps in a macro-step, in which all noise stays the same while the policy
-        goes on reacting. A rollout simulates ``rollout_depth * noise_hold`` environment steps.
-    :param proposal_dims: candidates (of a tree: all children, of the cross-entropy method: whole plans)
-        differ only in so many directions, those in which recently executed actions varied most. ``None``: in
-        all.
+        reacts to every state. A rollout simulates ``rollout_depth * noise_hold`` environment steps.
+    :param proposal_dims: number of directions in which candidates (for a tree: all children, for the
+        cross-entropy method: whole plans) differ, those in which recently executed actions varied most.
+        ``None``: all directions.
     :param forward_model: ``"auto"``, ``"mujoco"`` (batched MuJoCo), ``"pool"`` (copies of the
         environment) or ``"ensemble"`` (learned by the agent, for environments without snapshots).
-    :param n_threads: threads that simulate. 0: one per available processor core. The result does not
-        depend on it.
+    :param n_threads: simulation threads. 0: one per available processor core. The result does not depend on
+        it.
     :param matmul_precision: internal precision of the networks' float32 products during a search, as in
-        ``torch.set_float32_matmul_precision``: ``"medium"`` is quicker on processors that multiply bfloat16.
-        ``None``: as the process has it.
+        ``torch.set_float32_matmul_precision``: ``"medium"`` is faster on processors with bfloat16 support.
+        ``None``: the process's setting.
     :raises TypeError: if a value has the wrong type.
     :raises ValueError: if a value is out of range.
     """
@@ -116,12 +116,12 @@ class SearchSettings(CheckedSettings, ABC):
 
     @abstractmethod
     def _check_strategy(self) -> None:
-        """Check the strategy's own settings, and the others with them."""
+        """Check the strategy's own settings, also in combination with the others."""
 
     @property
     @abstractmethod
     def _factors(self) -> list[str]:
-        """The names of the settings whose product are the rollouts of a decision."""
+        """The names of the settings whose product is the number of rollouts of a decision."""
 
     def _check_size(self) -> None:
         factors = self._factors
@@ -176,7 +176,7 @@ class SearchSettings(CheckedSettings, ABC):
             )
 
     def is_noisy(self, spread: float) -> bool:
-        """Whether noise of a standard deviation is any noise at all.
+        """Whether noise with a standard deviation is not zero.
 
         :param spread: the standard deviation.
         """
@@ -193,19 +193,19 @@ class SearchSettings(CheckedSettings, ABC):
         return self.rollout_depth * self.noise_hold
 
     def distinct_simulations(self, deterministic: bool) -> int:
-        """How many simulations of a candidate can differ from one another.
+        """The number of simulations of a candidate that can differ.
 
-        :param deterministic: whether the environment's steps are.
+        :param deterministic: whether the environment is deterministic.
         :return: ``n_simulations``, or 1 where nothing is random.
         """
         return 1 if deterministic else self.n_simulations
 
     @abstractmethod
     def simulated_steps(self, deterministic: bool = True) -> int:
-        """The most environment steps that a decision simulates, per environment.
+        """The maximum number of simulated steps of a decision, per environment.
 
-        :param deterministic: whether the environment's steps are.
-        :return: steps; fewer are simulated where rollouts terminate.
+        :param deterministic: whether the environment is deterministic.
+        :return: steps; fewer are simulated if rollouts terminate.
         """
 
     @classmethod
@@ -214,10 +214,10 @@ class SearchSettings(CheckedSettings, ABC):
 
     @classmethod
     def of(cls, agent: Any) -> Self:
-        """Read the settings that an agent carries as attributes.
+        """Read the settings from an agent's attributes.
 
-        :param agent: an object that has settings as attributes, such as ``MCBSTD3``.
-        :return: the checked settings.
+        :param agent: an object with settings as attributes, such as ``MCBSTD3``.
+        :return: the checked settings of its strategy.
         """
         settings: dict[str, Any] = {name: getattr(agent, name) for name in cls.flat}
         settings["n_threads"] = as_dict("model_kwargs", agent.model_kwargs).get("n_threads", 0)
@@ -229,10 +229,10 @@ class SearchSettings(CheckedSettings, ABC):
 
     @staticmethod
     def preset(name: str, **changes: Any) -> "SearchSettings":
-        """Settings for an effort, by name.
+        """The settings of a preset.
 
         :param name: one of :data:`PRESETS`.
-        :param changes: settings that shall differ from the preset, as an agent's constructor takes them.
+        :param changes: settings that override the preset, as an agent's constructor takes them.
         :return: the settings.
         :raises ValueError: if there is no preset of that name.
         """
@@ -246,14 +246,14 @@ def make_settings(
     model_kwargs: Mapping[str, Any] | None = None,
     **settings: Any,
 ) -> SearchSettings:
-    """Make the settings of a strategy, from what an agent's constructor takes.
+    """Make the settings of a strategy from an agent's constructor arguments.
 
     :param strategy: one of :data:`STRATEGIES`.
-    :param search_kwargs: the settings of the strategy that are no keywords of the constructor.
+    :param search_kwargs: the settings of the strategy that are not keywords of the constructor.
     :param model_kwargs: ``n_threads``.
-    :param settings: the keywords that are about the search.
+    :param settings: the other keywords of the search.
     :return: the checked settings.
-    :raises TypeError: if a value has the wrong type, or a key is not known.
+    :raises TypeError: if a value has the wrong type, or a key is unknown.
     :raises ValueError: if a value is out of range.
     """
     strategy = present_name(strategy)
@@ -270,9 +270,9 @@ def make_settings(
 
 
 def present_name(strategy: Any) -> Any:
-    """The present name of a strategy.
+    """The current name of a strategy.
 
-    :param strategy: a name, of which an old one brings a warning.
+    :param strategy: a name; an old one causes a warning.
     """
     if isinstance(strategy, str) and strategy == "refine":
         _warn_of_old_name()
@@ -286,8 +286,8 @@ def _warn_of_old_name() -> None:
     warnings.warn(message, FutureWarning, stacklevel=4)
 
 
-#: The settings that presets change, by the names of the presets. Around trained agents in deterministic
-#: environments "efficient", "balanced" and "strong" simulate about 20, 110 and 580 steps per decision.
+#: The settings of presets that differ from the defaults. In deterministic environments "efficient",
+#: "balanced" and "strong" simulate about 20, 110 and 580 steps per decision.
 PRESETS: dict[str, dict[str, Any]] = {
     "paper": {},
     "efficient": dict(n_simulations=1, search_kwargs=dict(rollout_noise=0.0, include_policy_action=True)),
@@ -303,11 +303,11 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 
 def with_preset(name: str | None, changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Start from a preset.
+    """Combine a preset with explicit settings.
 
-    :param name: one of :data:`PRESETS`; ``None``: there is none.
-    :param changes: settings that stay as they are, whatever the preset says.
-    :return: the preset's settings and those, see :func:`merged`.
+    :param name: one of :data:`PRESETS`; ``None``: no preset.
+    :param changes: settings that override the preset.
+    :return: the combined settings, see :func:`merged`.
     :raises ValueError: if there is no preset of that name.
     """
     if name is None:
@@ -317,11 +317,12 @@ def with_preset(name: str | None, changes: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings with others over them: of ``search_kwargs`` and ``model_kwargs`` each key.
+    """Override settings with others, including single keys of ``search_kwargs`` and ``model_kwargs``.
 
     :param base: settings as an agent's constructor takes them.
-    :param changes: the same. What another strategy than that of ``base`` does not know is dropped from it.
-    :return: both.
+    :param changes: settings that override them. With another strategy, keys of ``base`` that it does not have
+        are dropped.
+    :return: the combined settings.
     """
     result = {**base, **changes}
     for group in ("search_kwargs", "model_kwargs"):

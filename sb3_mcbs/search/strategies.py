@@ -1,4 +1,4 @@
-"""The strategies by the classes of their settings, behind one way to call them."""
+"""Runs the strategy that belongs to a class of settings."""
 
 import logging
 
@@ -24,16 +24,16 @@ def search(
     directions: np.ndarray | None = None,
     plans: np.ndarray | None = None,
 ) -> SearchResult:
-    """Choose one action per environment by the strategy that the settings name.
+    """Choose one action per environment with the strategy of the settings.
 
     :param roots: where the search starts.
     :param functions: networks, discount and scales.
     :param settings: settings of the search.
-    :param rng: of the search: draws all noise, and is given to a model with random dynamics.
-    :param directions: ``[proposal_dims, act_dim]``, in which candidates differ; ``None``: in all.
-    :param plans: of the cross-entropy method: ``[n_envs, rollout_depth, act_dim]``, where it starts from;
-        ``None``: from the policy alone.
-    :return: actions, and what the search found.
+    :param rng: draws all noise, and is given to a model with random dynamics.
+    :param directions: ``[proposal_dims, act_dim]``, in which candidates differ; ``None``: all.
+    :param plans: ``[n_envs, rollout_depth, act_dim]``, warm start of the cross-entropy method; ``None``: the
+        policy alone.
+    :return: actions and details of the search.
     """
     value = CountedValue(functions.value)
     functions = functions._replace(value=value)
@@ -54,10 +54,10 @@ def search(
 
 
 def check_dynamics(settings: SearchSettings, deterministic: bool) -> None:
-    """Say which settings make no sense, or none with an environment's dynamics.
+    """Check settings against an environment's dynamics, and warn of meaningless ones.
 
-    :param settings: of the search.
-    :param deterministic: whether the environment's steps are.
+    :param settings: settings of the search.
+    :param deterministic: whether the environment is deterministic.
     :raises ValueError: if the search would follow the luckiest random draw.
     """
     if not deterministic and not isinstance(settings, BeamSettings) and settings.n_simulations == 1:

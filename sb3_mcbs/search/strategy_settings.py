@@ -12,10 +12,10 @@ class BeamSettings(SearchSettings):
     :class:`SearchSettings`, and these in ``search_kwargs``.
 
     :param time_budget: seconds that a decision may take, from the call to the action. Candidates are then
-        evaluated in rounds while the next is expected to finish in time, and the results depend on how fast
-        the machine is. ``None``: all candidates, however long it takes, and reproducible to the bit.
-    :param max_beam_width: with ``time_budget``, the number of candidates that is enough; ``None``:
-        ``beam_width``, which may leave time unused.
+        evaluated in rounds while the next is expected to finish in time, and results depend on the machine's
+        speed. ``None``: no limit, and results are reproducible bit for bit.
+    :param max_beam_width: with ``time_budget``, the largest number of candidates; ``None``: ``beam_width``,
+        which may leave time unused.
     """
 
     strategy = "beam"
@@ -55,7 +55,7 @@ class BeamSettings(SearchSettings):
                 )
 
     def distinct_simulations(self, deterministic: bool) -> int:
-        # Only Algorithm 1 draws the later actions of each simulation anew.
+        # Only Algorithm 1 draws separate noise for each simulation.
         noisy = self.is_noisy(self.effective_rollout_noise)
         return self.n_simulations if noisy else super().distinct_simulations(deterministic)
 
@@ -67,10 +67,10 @@ class BeamSettings(SearchSettings):
 
 @dataclass(frozen=True)
 class TreeSettings(SearchSettings):
-    """Settings of ``strategy="tree"``, where the best ``beam_width`` nodes of every depth grow children:
-    those of :class:`SearchSettings`, and this in ``search_kwargs``.
+    """Settings of ``strategy="tree"``, which expands the best ``beam_width`` nodes of every depth: those of
+    :class:`SearchSettings`, and this in ``search_kwargs``.
 
-    :param branching: children of a node.
+    :param branching: children per node.
     """
 
     strategy = "tree"
@@ -109,9 +109,9 @@ class CEMSettings(SearchSettings):
     """Settings of ``strategy="cem"``, the cross-entropy method (``n_rounds`` of ``beam_width`` plans, each
     round around the best so far): those of :class:`SearchSettings`, and these in ``search_kwargs``.
 
-    :param n_rounds: rounds of a decision.
-    :param n_elites: the best plans that a round goes on from. ``None``: a quarter of ``beam_width``.
-    :param min_noise: what the spread does not fall below, in the scaled action space.
+    :param n_rounds: rounds per decision.
+    :param n_elites: best plans to which the next round is fitted. ``None``: a quarter of ``beam_width``.
+    :param min_noise: lower bound of the spread, in the scaled action space.
     """
 
     strategy = "cem"
@@ -140,7 +140,7 @@ class CEMSettings(SearchSettings):
 
     @property
     def effective_n_elites(self) -> int:
-        """The best plans that a round goes on from."""
+        """Number of best plans to which the next round is fitted."""
         return max(1, self.beam_width // 4) if self.n_elites is None else self.n_elites
 
     def simulated_steps(self, deterministic: bool = True) -> int:

@@ -1,8 +1,8 @@
-"""Partial tree expansion: at every depth the best nodes are kept, and only those grow children.
+"""Partial tree expansion: at every depth the best nodes are kept and expanded.
 
-Axes: ``slots`` places for nodes per environment, some of them empty; ``sim`` simulations of each node. The
-forward model holds one row for each simulation that goes on, ordered by environment, simulation and slot. A
-depth is a macro-step of ``noise_hold`` environment steps.
+Axes: ``slots`` for nodes per environment, some of them empty; ``sim`` simulations of each node. The forward
+model holds one row per running simulation, ordered by environment, simulation and slot. A depth is a
+macro-step of ``noise_hold`` environment steps.
 """
 
 from typing import NamedTuple
@@ -35,8 +35,8 @@ from sb3_mcbs.types import ForwardModel, Observations, take_rows
 class TreeNoise(NamedTuple):
     """All random numbers of one decision.
 
-    :param roots: ``[n_envs, 1, proposals, act_dim]``, of the root actions.
-    :param later: ``[rollout_depth - 1, n_envs, beam, proposals / beam, act_dim]``, of kept nodes' actions.
+    :param roots: ``[n_envs, 1, proposals, act_dim]``, for the root actions.
+    :param later: ``[rollout_depth - 1, n_envs, beam, proposals / beam, act_dim]``, for kept nodes' actions.
     """
 
     roots: np.ndarray
@@ -59,7 +59,7 @@ class _Nodes(NamedTuple):
 
 
 class _View(NamedTuple):
-    """What the agent sees and does in the rows of the forward model.
+    """Observations and the policy's actions in the rows of the forward model.
 
     :param observations: ``[rows, *obs_shape]``.
     :param policy_actions: ``[rows, act_dim]``; meaningless where a simulation has ended.
@@ -70,13 +70,13 @@ class _View(NamedTuple):
 
 
 class _Growth(NamedTuple):
-    """What one depth brought.
+    """The results of one depth.
 
     :param nodes: all children.
     :param view: of the forward model's rows after the last step.
-    :param first_step: of every child that was stepped.
-    :param steps: simulated.
-    :param invalid: simulations that diverged or whose value is not finite.
+    :param first_step: of every simulated child.
+    :param steps: number of simulated steps.
+    :param invalid: number of simulations that diverged or whose value is not finite.
     """
 
     nodes: _Nodes
@@ -93,13 +93,13 @@ def draw_tree_noise(
     act_dim: int,
     directions: np.ndarray | None = None,
 ) -> TreeNoise:
-    """Draw the noise of one decision: first that of the root actions, then depth by depth.
+    """Draw the noise of one decision: first for the root actions, then depth by depth.
 
-    :param rng: generator of the search.
+    :param rng: draws the noise.
     :param settings: width, branching, depth and noise.
     :param n_envs: number of environments.
-    :param act_dim: entries of one action.
-    :param directions: ``[proposal_dims, act_dim]``, in which children differ; ``None``: in all.
+    :param act_dim: action dimensions.
+    :param directions: ``[proposal_dims, act_dim]``, in which children differ; ``None``: all.
     :return: the noise, clipped to ``noise_clip`` if that is set.
     """
     width, pairs = settings.beam_width, settings.antithetic
@@ -126,7 +126,7 @@ def tree_search(
     :param settings: width, branching, depth and simulations.
     :param noise: from :func:`draw_tree_noise`.
     :param rng: given to a model with random dynamics.
-    :return: actions, and what the search found.
+    :return: actions and details of the search.
     """
     model = roots.model
     assert model is not None, "a tree needs a forward model"
@@ -172,7 +172,7 @@ def tree_search(
 
 
 def _present(n_envs: int, n_sim: int) -> _Nodes:
-    """One node per environment: its present state, whose row is the number of its root."""
+    """One node per environment for its current state; its row is the index of the root."""
     return _Nodes(
         scores=np.zeros((n_envs, 1)),
         roots=np.zeros((n_envs, 1), dtype=int),
@@ -182,7 +182,7 @@ def _present(n_envs: int, n_sim: int) -> _Nodes:
 
 
 def _numbered(nodes: _Nodes) -> _Nodes:
-    """Children of the present state: each is a root action of its own."""
+    """Children of the current state, each with its own root action."""
     return nodes._replace(roots=np.broadcast_to(np.arange(nodes.roots.shape[1]), nodes.roots.shape))
 
 
@@ -194,11 +194,11 @@ def _children(
     functions: PolicyFunctions,
     settings: TreeSettings,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Propose actions in every simulation that goes on.
+    """Propose actions in every running simulation.
 
     :param drawn: ``[n_envs, slots, proposals, act_dim]``, the nodes' noise.
-    :param children: how many actions are kept per node.
-    :return: their actions and the noise in them, ``[simulations that go on * children, act_dim]``.
+    :param children: number of actions kept per node.
+    :return: actions and their noise, ``[running simulations * children, act_dim]``.
     """
     goes_on = nodes.rows >= 0
     rows = nodes.rows[goes_on]
@@ -207,7 +207,7 @@ def _children(
     if settings.n_proposals is not None:
         values = np.zeros((*goes_on.shape, drawn.shape[2]))
         values[goes_on] = critic_values(take_rows(view.observations, rows), actions, functions)
-        # Every simulation of a node must take the same children, so that the critics' mean decides.
+        # All simulations of a node must have the same children, so the critics' mean decides.
         of_nodes = values.sum(axis=1).reshape(-1, drawn.shape[2])
         kept = preselect(of_nodes, children, int(settings.include_policy_action))
         kept = kept.reshape(len(drawn), 1, -1, children)
@@ -226,10 +226,10 @@ def _grow(
     functions: PolicyFunctions,
     settings: TreeSettings,
 ) -> _Growth:
-    """Step the children, whose rows the forward model holds, for a macro-step, and value them.
+    """Step the children in the forward model for a macro-step, and compute their scores.
 
-    :param actions: ``[rows, act_dim]``, scaled, the first ones.
-    :param offsets: ``[rows, act_dim]``, what is added to the policy's actions in the steps after the first.
+    :param actions: ``[rows, act_dim]``, scaled actions of the first step.
+    :param offsets: ``[rows, act_dim]``, added to the policy's actions in the later steps.
     :param steps_before: environment steps from the root to the nodes.
     """
     stepped = np.repeat(nodes.rows >= 0, children, axis=2)
@@ -261,7 +261,7 @@ def _grow(
     with_values = returns.copy()
     with_values[stepped] = totals
     scores = with_values.mean(axis=1)
-    # A node that did not grow has no children.
+    # Nodes that were not expanded have no children.
     scores[~(np.isfinite(scores) & stepped.any(axis=1))] = -np.inf
 
     row_of = np.full(len(totals), -1)
@@ -273,7 +273,7 @@ def _grow(
 
 
 def _look(observations: Observations, goes_on: np.ndarray, functions: PolicyFunctions, act_dim: int) -> _View:
-    """Observe rows of the forward model, and ask the policy where the simulation goes on."""
+    """Observe rows of the forward model, and compute the policy's actions in running simulations."""
     policy_actions = np.zeros((len(goes_on), act_dim), dtype=np.float32)
     if goes_on.any():
         policy_actions[goes_on] = functions.policy(take_rows(observations, goes_on))
@@ -281,7 +281,7 @@ def _look(observations: Observations, goes_on: np.ndarray, functions: PolicyFunc
 
 
 def _finished(nodes: _Nodes) -> _Nodes:
-    """Nodes whose simulations have all ended: they grow no more, and stay in the ranking as they are."""
+    """Nodes whose simulations have all ended: they are not expanded, and stay in the ranking."""
     ended = (nodes.rows < 0).all(axis=1)
     return nodes._replace(scores=np.where(ended, nodes.scores, -np.inf))
 
@@ -293,11 +293,11 @@ def _join(left: _Nodes, right: _Nodes) -> _Nodes:
 def _keep_best(nodes: _Nodes, width: int) -> _Nodes:
     """Keep the best nodes of every environment.
 
-    :param width: how many.
-    :return: ``width`` slots: the kept nodes in the order in which they were, then empty ones.
+    :param width: number of nodes to keep.
+    :return: ``width`` slots: the kept nodes in their previous order, then empty ones.
     """
     kept = best(nodes.scores, width)
-    # The forward model gathers rows in order, so empty slots go to the end instead of in between.
+    # The forward model gathers rows in order, so empty slots must be at the end.
     kept_scores = np.take_along_axis(nodes.scores, kept, axis=1)
     order = np.argsort(np.isneginf(kept_scores), axis=1, kind="stable")
     kept, kept_scores = (np.take_along_axis(array, order, axis=1) for array in (kept, kept_scores))

@@ -1,4 +1,4 @@
-"""RL Zoo's commands with this package: registration, evaluation of both policies, tuning, repeating."""
+"""Integration with RL Zoo: registration, evaluation of both policies, tuning, repeating runs."""
 
 from sb3_mcbs.zoo.paths import hyperparams_path
 from sb3_mcbs.zoo.registration import register

@@ -1,4 +1,4 @@
-"""Evaluation callbacks that say which policy they measure, and measure the one that acts in training."""
+"""Evaluation callbacks for both policies of an agent: the actor alone, and with search."""
 
 from typing import Any
 
@@ -13,11 +13,11 @@ from sb3_mcbs.agents import MCBS, SearchPolicy
 
 
 class ActsWithSearch(EvalCallback):
-    """Evaluates an agent that searches in training as it acts in training; any other agent as it is."""
+    """Evaluates agents that search in training with search, and any other agent without."""
 
     def init_callback(self, model: BaseAlgorithm) -> None:
         """
-        :param model: the agent; saving and logging go to it, only the evaluated actions are searched
+        :param model: the agent; it is used for saving and logging, and only evaluated actions are searched
         """
         if isinstance(model, MCBS):
             super().init_callback(SearchPolicy(model, self.eval_env, seed=model.seed))  # type: ignore[arg-type]
@@ -26,7 +26,7 @@ class ActsWithSearch(EvalCallback):
 
 
 class SearchEvalCallback(ActsWithSearch):
-    """Takes the place of the ``EvalCallback`` of RL Zoo's training runs."""
+    """Replaces the ``EvalCallback`` of RL Zoo's training runs."""
 
     def _on_step(self) -> bool:
         due = self.eval_freq > 0 and self.n_calls % self.eval_freq == 0
@@ -36,7 +36,7 @@ class SearchEvalCallback(ActsWithSearch):
 
 
 class SearchTrialEvalCallback(ActsWithSearch, TrialEvalCallback):
-    """Takes the place of the callback whose last evaluation is the objective of RL Zoo's ``-optimize``."""
+    """Replaces the callback whose last evaluation is the objective of RL Zoo's ``-optimize``."""
 
     def _on_step(self) -> bool:
         evaluations = self.eval_idx
@@ -52,11 +52,11 @@ class SecondEvalCallback(EvalCallback):
     """
     Evaluates the policy that the run's own evaluation does not: the bare actor, or the agent with search.
 
-    It writes its own ``evaluations.npz`` and logs under ``eval_LABEL/``, so that a reader always knows which
-    policy a number belongs to. It keeps no best model and draws nothing from global random generators.
+    It writes its own ``evaluations.npz`` and logs under ``eval_LABEL/``, so each number names its policy. It
+    saves no best model and does not use global random generators.
 
-    :param eval_env: an evaluation environment of its own
-    :param label: what is measured, in the logger's keys: ``actor`` or ``search``
+    :param eval_env: a separate evaluation environment
+    :param label: the measured policy in the logger's keys: ``actor`` or ``search``
     :param search_settings: settings of the search; None evaluates the bare agent
     :param eval_kwargs: the other arguments of ``EvalCallback``
     """
@@ -89,7 +89,7 @@ class SecondEvalCallback(EvalCallback):
 
     @property
     def logger(self) -> Logger:
-        """The agent's logger, with the keys of a second evaluation."""
+        """The agent's logger, with keys of the second evaluation."""
         target = super().logger
         if self._renaming_logger is None or self._renaming_logger.target is not target:
             self._renaming_logger = RenamingLogger(target, "eval/", f"eval_{self.label}/")
@@ -112,11 +112,11 @@ class SecondEvalCallback(EvalCallback):
 
 class RenamingLogger(Logger):
     """
-    Records under other names in another logger and leaves writing it out to that one's owner.
+    Records in another logger under other names, without writing it out.
 
     :param target: the logger to record in
-    :param old: start of the keys to rename
-    :param new: what takes its place
+    :param old: prefix of the keys to rename
+    :param new: the new prefix
     """
 
     def __init__(self, target: Logger, old: str, new: str) -> None:
@@ -129,14 +129,14 @@ class RenamingLogger(Logger):
         """
         :param key: name of the value; renamed if it starts with ``old``
         :param value: the value
-        :param exclude: outputs to leave it out of
+        :param exclude: outputs that do not get it
         """
         renamed = self.new + key.removeprefix(self.old) if key.startswith(self.old) else key
         self.target.record(renamed, value, exclude)
 
     def dump(self, step: int = 0) -> None:
         """
-        Write nothing: the run's own evaluation follows at once and writes both.
+        Write nothing: the run's own evaluation follows immediately and writes both.
 
         :param step: not used
         """

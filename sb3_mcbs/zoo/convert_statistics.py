@@ -1,4 +1,4 @@
-"""``sb3-mcbs convert-statistics vecnormalize.pkl out.npz --trusted``: normalisation statistics as numbers."""
+"""``sb3-mcbs convert-statistics vecnormalize.pkl out.npz --trusted``: normalisation statistics as npz."""
 
 import argparse
 import pickle
@@ -12,12 +12,12 @@ def convert_statistics(pickle_path: str | Path, npz_path: str | Path, trusted: b
     """
     Write the statistics of a pickled ``VecNormalize`` as npz.
 
-    :param pickle_path: what ``VecNormalize.save`` or RL Zoo wrote, usually ``vecnormalize.pkl``
+    :param pickle_path: a file from ``VecNormalize.save`` or RL Zoo, usually ``vecnormalize.pkl``
     :param npz_path: the file to write, for ``sb3_mcbs.loading.normalization.load_statistics``
-    :param trusted: that the caller trusts the pickle's author
+    :param trusted: whether the caller trusts the pickle's author
     :raises PermissionError: without ``trusted``
-    :raises ValueError: if the file is no pickle, or its code fails
-    :raises TypeError: if the file holds something else
+    :raises ValueError: if the file is not a pickle, or its code fails
+    :raises TypeError: if the file contains something else
     """
     if not trusted:
         raise PermissionError(
@@ -27,7 +27,7 @@ def convert_statistics(pickle_path: str | Path, npz_path: str | Path, trusted: b
     with Path(pickle_path).open("rb") as stream:
         try:
             vec_normalize = pickle.load(stream)
-        except Exception as error:  # whatever the code in it raises
+        except Exception as error:  # the pickle's code may raise anything
             raise ValueError(
                 f"{pickle_path} cannot be unpickled ({type(error).__name__}: {error}). Name a file that "
                 "VecNormalize.save or RL Zoo wrote, usually vecnormalize.pkl."

@@ -36,13 +36,13 @@ from sb3_mcbs.zoo.callbacks import SearchEvalCallback, SecondEvalCallback
 from sb3_mcbs.zoo.paths import PathError, hyperparams_path, sibling_folder
 from sb3_mcbs.zoo.sampler import HELD, with_limits
 
-#: ``-conf sb3_mcbs`` names this package's file for the algorithm of the command line.
+#: ``-conf sb3_mcbs`` selects this package's file for the algorithm of the command line.
 PACKAGE_CONFIG = "sb3_mcbs"
-#: Agents with a policy and critics that a search can be put on.
+#: Algorithms that ``SearchPolicy`` supports.
 SEARCHABLE = ("ddpg", "sac", "td3", "tqc")
 #: The folder of exact checkpoints within a run's folder.
 CHECKPOINTS = "checkpoints"
-#: The settings that are names, and what they may be.
+#: The settings that are names, and their valid values.
 NAMES = {
     "preset": tuple(PRESETS),
     "strategy": tuple(STRATEGIES),
@@ -55,11 +55,11 @@ NAMES = {
 
 class ResumedRun(NamedTuple):
     """
-    A run that is continued instead of a new one.
+    A run to continue.
 
-    :param folder: its folder
-    :param checkpointed: the run, as its newest checkpoint has it
-    :param log_folder: its folder for TensorBoard, if it has one
+    :param folder: the run's folder
+    :param checkpointed: the run as of its newest checkpoint
+    :param log_folder: the run's TensorBoard folder, if any
     """
 
     folder: Path
@@ -71,11 +71,11 @@ class MCBSExperimentManager(ExperimentManager):
     """
     Finds this package's hyperparameter files and evaluates both policies of an agent.
 
-    For ``mcbs_td3`` and the other algorithms that search in training the run folder's ``evaluations.npz`` is
-    the agent with search, as it acts in training, and the bare actor's goes to the sibling algorithm folder
-    (``mcbs_td3_actor``). Another off-policy algorithm whose hyperparameters contain ``search_evaluation`` (a
-    dictionary of search settings) is evaluated as it is in the run folder, and with search in the sibling
-    folder ``ALGO_search``. All else is RL Zoo's.
+    For ``mcbs_td3`` and the other algorithms that search in training, ``evaluations.npz`` in the run's folder
+    is of the agent with search, as it acts in training, and that of the bare actor is in the sibling folder
+    ``mcbs_td3_actor``. Another off-policy algorithm whose hyperparameters contain ``search_evaluation`` (a
+    dictionary of search settings) is evaluated without search in the run's folder, and with search in the
+    sibling folder ``ALGO_search``. Everything else is RL Zoo's.
 
     An ``ExactCheckpointCallback`` without a path writes into the run's folder.
 
@@ -101,7 +101,7 @@ class MCBSExperimentManager(ExperimentManager):
 
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
         """
-        Set up the experiment as RL Zoo does, and put a resumed run's agent on its way.
+        Set up the experiment as RL Zoo does, and prepare the agent of a resumed run.
 
         :return: the agent and the hyperparameters; None when tuning
         """
@@ -116,11 +116,10 @@ class MCBSExperimentManager(ExperimentManager):
         """
         Read the hyperparameters as RL Zoo does, and accept 0 as a trial's number.
 
-        A preset of the command line goes before what the file says of the search.
+        A preset of the command line overrides the file's settings of the search.
 
-        :raises ValueError: if trials that draw the search's settings are given a preset
-
-        :return: the hyperparameters, and the same in order, to be saved
+        :return: the hyperparameters, and the same sorted, to be saved
+        :raises ValueError: if a preset is given while tuning
         """
         first_trial = self.trial_id == 0 and self.storage and self.study_name
         if first_trial and self.algo in SEARCHING and not self.optimize_hyperparameters:
@@ -142,12 +141,12 @@ class MCBSExperimentManager(ExperimentManager):
         self, storage: str, study_name: str, trial_id: int | None = None, convert: bool = True
     ) -> dict[str, Any]:
         """
-        Load a trial's parameters as RL Zoo does, with the limits that the trial searched in.
+        Load a trial's parameters as RL Zoo does, with the limits that the trial had.
 
-        :param storage: where the study is
-        :param study_name: its name
+        :param storage: storage of the study
+        :param study_name: name of the study
         :param trial_id: the trial's number; None: the best one
-        :param convert: whether to make constructor arguments of them
+        :param convert: whether to convert the parameters to constructor arguments
         :return: the parameters
         """
         params = super().load_trial(storage, study_name, trial_id, convert)
@@ -170,14 +169,14 @@ class MCBSExperimentManager(ExperimentManager):
 
     def objective(self, trial: optuna.Trial) -> float:
         """
-        Evaluate a trial as RL Zoo does, and prune one that asks more of the simulator than it can.
+        Evaluate a trial as RL Zoo does, and prune it if the forward model cannot simulate it.
 
-        What the hyperparameter file says of the search is noted with the trial, so that the sampler draws
-        nothing that does not go with it.
+        The hyperparameter file's settings of the search are stored with the trial, so that the sampler avoids
+        conflicts with them.
 
         :param trial: Optuna's trial
-        :return: the return that is maximised
-        :raises optuna.TrialPruned: also where RL Zoo prunes
+        :return: the return to maximise
+        :raises optuna.TrialPruned: for pruned trials
         """
         if self.algo in SEARCHING:
             names = {"optimize_memory_usage", *SETTINGS}
@@ -190,7 +189,7 @@ class MCBSExperimentManager(ExperimentManager):
             raise optuna.TrialPruned(str(reason)) from reason
 
     def create_callbacks(self) -> None:
-        """Create RL Zoo's callbacks, and the second evaluation just before the run's own."""
+        """Create RL Zoo's callbacks, and the second evaluation before the run's own."""
         for callback in self.callbacks:
             if isinstance(callback, ExactCheckpointCallback) and callback.path is None:
                 if self.optimize_hyperparameters:
@@ -228,7 +227,7 @@ class MCBSExperimentManager(ExperimentManager):
 
 
 def _check_names(custom: dict[str, Any]) -> None:
-    """End with one line if text of the command line is not what a setting may be.
+    """Exit with a one-line error for invalid settings of the command line.
 
     :param custom: hyperparameters of the command line.
     """

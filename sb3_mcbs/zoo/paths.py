@@ -1,4 +1,4 @@
-"""Where this package's hyperparameter files and an RL Zoo run's files lie."""
+"""Paths of this package's hyperparameter files and of RL Zoo's runs."""
 
 from pathlib import Path
 
@@ -6,7 +6,7 @@ PACKAGE_ROOT = Path(__file__).resolve().parents[1]
 
 
 class PathError(FileNotFoundError):
-    """A path is not what a command needs; the message says what to name instead."""
+    """A path is not what a command needs; the message says what to pass instead."""
 
 
 def hyperparams_path(algo: str) -> Path:
@@ -31,10 +31,10 @@ def hyperparams_path(algo: str) -> Path:
 
 def sibling_folder(run_folder: str | Path, label: str) -> Path:
     """
-    Where the second evaluation of a run goes: RL Zoo's plots take each algorithm folder as one curve.
+    The folder of a run's second evaluation: RL Zoo's plots draw one curve per algorithm folder.
 
     :param run_folder: a run's folder, ``LOGS/ALGO/ENV_NUMBER``
-    :param label: what the second evaluation measures, ``actor`` or ``search``
+    :param label: the policy of the second evaluation, ``actor`` or ``search``
     :return: ``LOGS/ALGO_LABEL/ENV_NUMBER``
     """
     run_folder = Path(run_folder)

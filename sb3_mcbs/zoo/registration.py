@@ -1,8 +1,8 @@
 """
-Puts this package's algorithms and its ExperimentManager into RL Zoo's tables.
+Adds this package's algorithms and its ExperimentManager to RL Zoo.
 
-Called by the import hook, module by module while RL Zoo is being imported, or at once by :func:`register`.
-Nothing here may import RL Zoo at the top: the hook calls from the middle of RL Zoo's own import.
+Called by the import hook for each module while RL Zoo is imported, or for all modules by :func:`register`.
+This module must not import RL Zoo at the top level: the hook calls it during RL Zoo's own import.
 """
 
 import importlib
@@ -21,20 +21,20 @@ from sb3_mcbs.agents.hyperparameters import MOVED, REMOVED, SETTINGS
 from sb3_mcbs.agents.registry import SEARCHING
 from sb3_mcbs.zoo.sampler import convert_mcbs_params, sample_mcbs_params
 
-#: Hyperparameters whose values may be names, which need no quotes on the command line.
+#: Hyperparameters whose values may be names without quotes on the command line.
 NAMED = frozenset(
     (*SETTINGS, *MOVED, *REMOVED, "policy", "noise_type", "env_wrapper", "vec_env_wrapper", "callback")
 )
-#: What MuJoCo says whenever it reads HalfCheetah's XML, which is Gymnasium's and nobody here can change.
+#: MuJoCo's warning about HalfCheetah's XML, which is part of Gymnasium.
 DEPRECATION = "compiler attribute 'settotalmass' is deprecated"
 
 
 def register() -> None:
     """
-    Add this package to RL Zoo: ``mcbs_td3`` and the others become algorithms of its commands.
+    Add ``mcbs_td3`` and the other algorithms of this package to RL Zoo's commands.
 
-    An installed package does this by itself as soon as ``rl_zoo3`` is imported; call it where the import hook
-    is switched off. Calling it again changes nothing.
+    An installed package does this by itself when ``rl_zoo3`` is imported. Call it if the import hook is
+    switched off. Calling it again changes nothing.
 
     :raises ImportError: if RL Zoo is not installed
     """
@@ -44,9 +44,9 @@ def register() -> None:
 
 def after_import(module: ModuleType) -> None:
     """
-    Add what belongs into one of RL Zoo's modules.
+    Patch one of RL Zoo's modules.
 
-    :param module: a module that has just been imported; others than RL Zoo's tables are left alone
+    :param module: a module that has just been imported; other modules are not changed
     """
     if module.__name__ in _PATCHES:
         _PATCHES[module.__name__](module)
@@ -61,7 +61,7 @@ def _add_algorithms(utils: Any) -> None:
 
 
 def _accept_names(utils: Any) -> None:
-    """Let ``-params preset:strong`` mean the text ``"strong"``: RL Zoo takes every value for Python code."""
+    """Read ``-params preset:strong`` as the text ``"strong"``: RL Zoo evaluates every value as Python."""
     store = utils.StoreDict
     evaluate = store.__call__
     if evaluate.__module__ == __name__:
@@ -76,10 +76,10 @@ def _accept_names(utils: Any) -> None:
 
 
 def _quoted(word: str, scope: dict[str, Any]) -> str:
-    """Put quotes around a hyperparameter's value where it is a name that is not defined.
+    """Quote a hyperparameter's value if it is an undefined name.
 
-    :param word: of the command line, ``NAME:VALUE``.
-    :param scope: where RL Zoo evaluates values.
+    :param word: an argument ``NAME:VALUE`` of the command line.
+    :param scope: the namespace in which RL Zoo evaluates values.
     """
     name, _, value = word.partition(":")
     if name in NAMED and re.fullmatch(r"[A-Za-z_][\w.-]*", value):
@@ -92,7 +92,7 @@ def _quoted(word: str, scope: dict[str, Any]) -> str:
 
 def make_vec_env(env_id: Callable[..., gym.Env], *args: Any, **kwargs: Any) -> VecEnv:
     """
-    SB3's ``make_vec_env``, without one warning of MuJoCo for each HalfCheetah that is made.
+    SB3's ``make_vec_env``, without a MuJoCo warning for each HalfCheetah.
 
     :param env_id: the callable that makes an environment, as RL Zoo passes it
     :param args: further arguments of SB3's function
@@ -105,7 +105,7 @@ def make_vec_env(env_id: Callable[..., gym.Env], *args: Any, **kwargs: Any) -> V
 def _without_deprecation(make: Callable[..., gym.Env]) -> Callable[..., gym.Env]:
     hidden = DEPRECATION
 
-    # A worker process gets this function by value, as it is nested: it need not import this package.
+    # Nested functions are pickled by value, so worker processes need not import this package.
     def make_env(**kwargs: Any) -> gym.Env:
         import ctypes
         import sys
@@ -118,7 +118,7 @@ def _without_deprecation(make: Callable[..., gym.Env]) -> Callable[..., gym.Env]
             if hidden in message:
                 return
             if show is not None:
-                # dm_control's takes bytes. MuJoCo ends the process if this function raises anything.
+                # dm_control's handler takes bytes. MuJoCo ends the process if this function raises.
                 show(message.encode() if isinstance(show, ctypes._CFuncPtr) else message)  # type: ignore[attr-defined]
             else:  # as MuJoCo does by itself
                 print(f"WARNING: {message}\n", file=sys.stderr)
@@ -144,13 +144,13 @@ def _add_manager(exp_manager: Any) -> None:
     manager = importlib.import_module("sb3_mcbs.zoo.manager")
     subclass = getattr(manager, "MCBSExperimentManager", None)
     if subclass is None:
-        return  # manager.py is importing rl_zoo3.exp_manager at this moment; it is announced again at its end
+        return  # manager.py is importing rl_zoo3.exp_manager; the hook calls again when it is done
     callbacks = importlib.import_module("sb3_mcbs.zoo.callbacks")
     original = subclass.__base__
     exp_manager.make_vec_env = make_vec_env
     exp_manager.EvalCallback = callbacks.SearchEvalCallback
     exp_manager.TrialEvalCallback = callbacks.SearchTrialEvalCallback
-    # The commands bind the class under their own name when they are imported.
+    # The commands import the class by name.
     for name in ("rl_zoo3.exp_manager", "rl_zoo3.train", "rl_zoo3.enjoy", "rl_zoo3.record_video"):
         module = sys.modules.get(name)
         if getattr(module, "ExperimentManager", None) is original:

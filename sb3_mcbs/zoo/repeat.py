@@ -1,4 +1,4 @@
-"""``python -m sb3_mcbs.zoo.repeat RUN_FOLDER``: do an RL Zoo run again, from what it saved."""
+"""``python -m sb3_mcbs.zoo.repeat RUN_FOLDER``: repeat an RL Zoo run from its saved files."""
 
 import argparse
 import importlib
@@ -20,7 +20,7 @@ from sb3_mcbs.zoo.paths import PathError
 CONFIG_MODULE = "sb3_mcbs_repeated_run"
 #: Packages whose classes and functions a saved configuration may name.
 TRUSTED_PACKAGES = ("torch", "stable_baselines3", "sb3_contrib", "rl_zoo3", "gymnasium", "sb3_mcbs")
-#: What a run's saved configuration already contains, or what belongs to tuning.
+#: Arguments that the saved configuration already contains, or that belong to tuning.
 NOT_REPEATED = ("hyperparams", "conf_file", "storage", "study_name", "trial_id", "log_folder", "command")
 
 _PYTHON_TAG = "tag:yaml.org,2002:python/"
@@ -89,7 +89,7 @@ def _read_yaml(path: Path) -> dict[str, Any]:
 
 def command_line(args: dict[str, Any]) -> list[str]:
     """
-    Write saved arguments as the command line they came from.
+    Convert saved arguments back to a command line.
 
     :param args: the content of ``args.yml``
     :return: arguments for ``rl_zoo3.train``, without the hyperparameters
@@ -98,7 +98,7 @@ def command_line(args: dict[str, Any]) -> list[str]:
     for name, value in sorted(args.items()):
         option = f"--{name.replace('_', '-')}"
         if name == "truncate_last_trajectory":
-            # Declared with type=bool: every text but the empty one is true.
+            # Declared with type=bool: every non-empty text is true.
             words += [option, "yes" if value else ""]
         elif name in NOT_REPEATED or value is None or value is False or value == "" or value == []:
             continue
@@ -117,9 +117,9 @@ def repeat(run_folder: str | Path, extra: Sequence[str] = ()) -> None:
     """
     Train again with the hyperparameters, the arguments and the seed of a run.
 
-    :param run_folder: the folder of the run; the new one lies beside it
+    :param run_folder: the run's folder; the new run's folder is next to it
     :param extra: arguments of ``rl_zoo3.train`` that replace the run's own
-    :raises PathError: if the folder is not that of a run, or the agent that the run continued is not there
+    :raises PathError: if the folder is not that of a run, or the agent that the run continued is missing
     """
     config, args = load_run(run_folder)
     agent = args.get("trained_agent")

@@ -1,4 +1,4 @@
-"""``python -m sb3_mcbs.zoo.report``: what a run's two policies reach, in two lines and a picture."""
+"""``python -m sb3_mcbs.zoo.report``: returns and learning curves of a run's two policies."""
 
 import argparse
 import sys
@@ -28,9 +28,9 @@ class Evaluations(NamedTuple):
 
 def load_evaluations(folder: str | Path) -> Evaluations:
     """
-    Read what an ``EvalCallback`` wrote.
+    Read an ``EvalCallback``'s file.
 
-    :param folder: the folder that holds ``evaluations.npz``
+    :param folder: the folder that contains ``evaluations.npz``
     :return: its content
     :raises PathError: if there is no such folder, or no evaluation in it
     """
@@ -53,7 +53,7 @@ def load_policies(run_folder: str | Path) -> dict[str, Evaluations]:
     Read the evaluations of a run's policies.
 
     :param run_folder: ``LOGS/ALGO/ENV_NUMBER``
-    :return: evaluations of ``actor alone`` and of ``actor with search``, as far as they were made
+    :return: evaluations of ``actor alone`` and of ``actor with search``, if available
     """
     own = load_evaluations(run_folder)
     if (sibling_folder(run_folder, "actor") / "evaluations.npz").is_file():
@@ -65,7 +65,7 @@ def load_policies(run_folder: str | Path) -> dict[str, Evaluations]:
 
 def newest_run(log_folder: str | Path, algo: str, env_id: str) -> Path:
     """
-    Find the run that was evaluated last.
+    Find the most recently evaluated run.
 
     :param log_folder: RL Zoo's log folder
     :param algo: the algorithm's name on RL Zoo's command line
@@ -84,13 +84,13 @@ def newest_run(log_folder: str | Path, algo: str, env_id: str) -> Path:
 
 def draw(policies: dict[str, Evaluations], title: str, path: Path) -> None:
     """
-    Draw learning curves: mean over the episodes of an evaluation, and their range.
+    Draw learning curves: mean and range over the episodes of each evaluation.
 
     :param policies: evaluations by name
-    :param title: title of the picture
+    :param title: title of the plot
     :param path: the PNG file to write
     """
-    # Without pyplot, which would pick a backend for the whole process, perhaps one with windows.
+    # Without pyplot, which would choose a backend for the whole process, perhaps one with windows.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -110,7 +110,7 @@ def draw(policies: dict[str, Evaluations], title: str, path: Path) -> None:
 
 def report(run_folder: str | Path) -> list[str]:
     """
-    Draw a run's learning curves into its folder and put its results into words.
+    Plot a run's learning curves in its folder and summarise its results.
 
     :param run_folder: ``LOGS/ALGO/ENV_NUMBER``
     :return: the lines to print

@@ -14,11 +14,11 @@ from sb3_mcbs.zoo.repeat import load_run, repeat
 
 def resume(run_folder: str | Path) -> None:
     """
-    Continue a run in its own folder, to the end that it would have had.
+    Continue a run in its own folder until its original end.
 
     :param run_folder: ``LOGS/ALGO/ENV_NUMBER``, of a run with an ``ExactCheckpointCallback``
     :raises PathError: if the folder is not that of a run
-    :raises CheckpointError: if it has no checkpoint that is whole
+    :raises CheckpointError: if it has no intact checkpoint
     """
     folder = Path(run_folder).resolve()
     _, args = load_run(folder)

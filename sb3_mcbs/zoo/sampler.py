@@ -1,11 +1,10 @@
 """
-What ``-optimize`` draws for our algorithms, and how a trial's parameters become constructor arguments.
+Samples hyperparameters for ``-optimize``, and converts a trial's parameters to constructor arguments.
 
-By default only the size and noise of the search are tuned and the other settings of the hyperparameter file
-are held, so that trials differ in one thing. ``SB3_MCBS_TUNE=strategies`` tunes how it searches as well,
-``SB3_MCBS_TUNE=schedules`` when it searches and what is learned from it, ``SB3_MCBS_TUNE=all`` what RL Zoo
-tunes of the algorithm without search. Trials know no ``preset``: one in the hyperparameter file would change
-what a trial does not draw.
+By default only the size and noise of the search are tuned; other settings of the hyperparameter file are
+held. ``SB3_MCBS_TUNE=strategies`` also tunes the strategy, ``SB3_MCBS_TUNE=schedules`` the schedule and
+value expansion, ``SB3_MCBS_TUNE=all`` what RL Zoo tunes of the algorithm without search. Trials have no
+``preset``, since it would change settings that are not sampled.
 """
 
 import os
@@ -34,33 +33,33 @@ N_ROUNDS = (2, 3, 4)
 NOISE_HOLD = (1, 2, 3)
 PROPOSAL_DIMS = (None, 1, 2, 3)
 SEARCH_SHARES = (0.25, 0.5, 1.0)
-#: As parts of ``search_share``.
+#: Fractions of ``search_share``.
 FINAL_SEARCH_SHARES = (0.0, 0.2, 0.5)
 VALUE_EXPANSION = (0, 1, 2, 4)
 
-#: A trial whose decisions cost more simulated steps than this would take days.
+#: Simulated steps per decision; with more, a trial would take days.
 MAX_SIMULATED_STEPS = 600
 
-#: What trials store of a strategy under names that are no settings themselves.
+#: Parameters of trials that are not settings themselves.
 _HELPERS = ("proposal_factor", "noise_free_rollouts", "final_share_factor")
 
 _NO_PRESET: dict[str, Any] = {"preset": None}
 
-#: The user attribute of a trial that says what the hyperparameter file holds of the search.
+#: The user attribute of a trial with the hyperparameter file's settings of the search.
 HELD = "held_settings"
-#: Limits stay as they are held where the scope "strategies" draws the rest of ``search_kwargs``.
-#: The last is the cross-entropy method's alone.
+#: Limits are kept from the file when the scope "strategies" samples the rest of ``search_kwargs``.
+#: The last belongs to the cross-entropy method only.
 _LIMITS = ("noise_clip", "time_budget", "max_beam_width", "min_noise")
-#: What the scope "schedules" replaces of the held ``schedule_kwargs``.
+#: Keys of ``schedule_kwargs`` that the scope "schedules" replaces.
 _ENDS = ("final_search_share", "final_beam_width", "final_rollout_depth")
-#: What trials store under names that are no keywords.
+#: Parameters of trials that are not keywords.
 _STORED = (*_HELPERS, *MOVED, *REMOVED)
 
 
 def tuning_scope() -> str:
     """
-    :return: one of ``SCOPES``, as the environment variable ``SB3_MCBS_TUNE`` says
-    :raises ValueError: if it says anything else
+    :return: the value of the environment variable ``SB3_MCBS_TUNE``, one of ``SCOPES``
+    :raises ValueError: for any other value
     """
     scope = os.environ.get(SWITCH) or "search"
     if scope not in SCOPES:
@@ -74,13 +73,13 @@ def sample_mcbs_params(
     """
     Sampler for the hyperparameters of an agent that searches.
 
-    :param base: RL Zoo's name of the same algorithm without search
+    :param base: RL Zoo's name of the algorithm without search
     :param trial: Optuna's trial
-    :param n_actions: number of entries of an action, for the noise of TD3 and DDPG
+    :param n_actions: number of action dimensions, for the noise of TD3 and DDPG
     :param n_envs: number of training environments
-    :param additional_args: what RL Zoo's samplers need to know of the replay buffer
+    :param additional_args: arguments of RL Zoo's samplers
     :return: constructor arguments
-    :raises optuna.TrialPruned: for settings that do not go together, or of too long a search
+    :raises optuna.TrialPruned: for conflicting settings, or too many simulated steps
     """
     scope = tuning_scope()
     held = trial.user_attrs.get(HELD, {})
@@ -110,7 +109,7 @@ def sample_mcbs_params(
 
 
 def _sample_strategy(trial: optuna.Trial) -> dict[str, Any]:
-    """Draw how to search, by the names that the trial stores."""
+    """Sample the strategy, by the trial's parameter names."""
     strategy = trial.suggest_categorical("strategy", STRATEGIES)
     sampled: dict[str, Any] = {
         "strategy": strategy,
@@ -130,7 +129,7 @@ def _sample_strategy(trial: optuna.Trial) -> dict[str, Any]:
 
 
 def _sample_schedule(trial: optuna.Trial) -> dict[str, Any]:
-    """Draw when to search and what to learn from it, by the names that the trial stores."""
+    """Sample the schedule and value expansion, by the trial's parameter names."""
     sampled: dict[str, Any] = {
         "search_schedule": trial.suggest_categorical("search_schedule", SCHEDULES),
         "search_share": trial.suggest_categorical("search_share", SEARCH_SHARES),
@@ -143,13 +142,13 @@ def _sample_schedule(trial: optuna.Trial) -> dict[str, Any]:
 
 
 def _search_settings(sampled: dict[str, Any]) -> dict[str, Any]:
-    """Turn what a trial stores of the search into constructor arguments."""
+    """Convert a trial's parameters of the search to constructor arguments."""
     settings = {name: value for name, value in sampled.items() if name not in _STORED}
     kwargs = {name: value for name, value in sampled.items() if MOVED.get(name) == "search_kwargs"}
     if sampled.get("noise_free_rollouts"):
         kwargs["rollout_noise"] = 0.0
     if settings.get("strategy", "beam") != "beam":
-        settings["n_simulations"] = 1  # more are for random environments
+        settings["n_simulations"] = 1  # more are only needed for random dynamics
     if sampled.get("proposal_factor", 1) > 1:
         n_kept = settings["beam_width"] * kwargs.get("branching", 1)
         kwargs["n_proposals"] = sampled["proposal_factor"] * n_kept
@@ -166,10 +165,10 @@ def _search_settings(sampled: dict[str, Any]) -> dict[str, Any]:
 
 def with_limits(params: dict[str, Any], held: dict[str, Any]) -> dict[str, Any]:
     """
-    Keep of the held dictionaries what trials do not draw, since those of a trial replace them.
+    Keep keys of the file's dictionaries that trials do not sample, since a trial's dictionaries replace them.
 
     :param params: constructor arguments
-    :param held: what the hyperparameter file says of the search
+    :param held: the hyperparameter file's settings of the search
     :return: the arguments with the held limits
     """
     kwargs, ends = held.get("search_kwargs") or {}, held.get("schedule_kwargs") or {}
@@ -213,7 +212,7 @@ def _why_senseless(params: dict[str, Any], sampled: dict[str, Any], n_actions: i
 
 def convert_mcbs_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     """
-    Turn the parameters that a trial stored back into constructor arguments.
+    Convert a trial's stored parameters back to constructor arguments.
 
     :param sampled_params: ``trial.params``
     :return: constructor arguments, as the sampler returned them
@@ -228,7 +227,7 @@ def convert_mcbs_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
 
     others = convert_offpolicy_params(others)
     if others.get("noise_type", "") is None:
-        # The trial ran with the file's noise then: RL Zoo's sampler gives no noise for None.
+        # The trial then used the file's noise: RL Zoo's sampler returns no noise for None.
         del others["noise_type"]
         others.pop("noise_std", None)
     return {**others, **search}

@@ -1,4 +1,4 @@
-"""``python -m sb3_mcbs.zoo.train``: the command line of ``rl_zoo3.train``, import hook or not."""
+"""``python -m sb3_mcbs.zoo.train``: the command line of ``rl_zoo3.train``, also without the import hook."""
 
 from sb3_mcbs.zoo.registration import register
 
