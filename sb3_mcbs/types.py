@@ -29,7 +29,7 @@ class Transition(NamedTuple):
     :param valid: ``[rows]`` bool. False where the simulation diverged: nothing else that the row
         says may be used, and stepping it again has no meaning.
     :param stopped: ``[rows]`` bool, or ``None`` for nowhere. True where the environment itself truncated the
-        episode: no step can follow, but the state is no terminal one, and a value closes the simulation.
+        episode: no step can follow, but the state is not terminal: the return bootstraps from the critics.
     """
 
     observations: Observations
@@ -151,9 +151,9 @@ def put_rows(target: Observations, into: Any, source: Observations, index: Any) 
     """Copy rows into other observations.
 
     :param target: ``[n, *obs_shape]``, changed in place.
-    :param into: which of its rows, or other places.
+    :param into: index of its rows.
     :param source: ``[rows, *obs_shape]``.
-    :param index: which of its rows, or other places, as many.
+    :param index: index of its rows, of the same length.
     """
     if isinstance(target, dict):
         assert isinstance(source, dict)

@@ -270,12 +270,12 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
         assert self._last_obs is not None, "self._last_obs was not set"
         assert self.planner is not None and self.search_rng is not None, "learn() needs an environment"
         assert self._schedule is not None
-        effort = self._schedule.settings_at(self.planner.settings, self._progress)
+        settings = self._schedule.settings_at(self.planner.settings, self._progress)
         if self._vec_normalize_env is not None:
             self.planner.normalize_rewards(self._vec_normalize_env.norm_reward)
         start = time.perf_counter()
-        result = self.planner.plan(self._last_obs, self.search_rng, envs, effort)
-        record_decision(self, result, time.perf_counter() - start, effort)
+        result = self.planner.plan(self._last_obs, self.search_rng, envs, settings)
+        record_decision(self, result, time.perf_counter() - start, settings)
         return result
 
     @property

@@ -189,7 +189,7 @@ class WarmStart:
         """Shift the plans by the steps since their decisions.
 
         :param envs: the environments that decide.
-        :param now: the present moment of each.
+        :param now: the episode clock of each, at present.
         :param noise_hold: environment steps in a macro-step.
         :return: ``[len(envs), rollout_depth, act_dim]``, by macro-steps; 0 where nothing is left.
         """
@@ -208,9 +208,9 @@ class WarmStart:
         :param now: the current episode clock of each.
         """
         by_step = np.repeat(plans, self._plans.shape[1] // plans.shape[1], axis=1)
-        for plan, env, moment in zip(by_step, envs, now, strict=True):
+        for plan, env, clock in zip(by_step, envs, now, strict=True):
             self._plans[env] = plan
-            self._episode_clocks[env] = moment
+            self._episode_clocks[env] = clock
 
     def _ages(self, envs: Sequence[int], now: Sequence[EpisodeClock]) -> list[int]:
         """Steps since the decisions; -1 where there is no plan for this episode."""

@@ -177,8 +177,8 @@ class RecentActions:
 
         :param actions: ``[n, act_dim]``, scaled, as executed.
         """
-        places = (self._count + np.arange(len(actions))) % RECENT
-        self._actions[places[-RECENT:]] = actions[-RECENT:]
+        rows = (self._count + np.arange(len(actions))) % RECENT
+        self._actions[rows[-RECENT:]] = actions[-RECENT:]
         self._count += len(actions)
 
     def directions(self, n_directions: int) -> np.ndarray | None:
