@@ -115,11 +115,16 @@ def watch_parts(agent: Any) -> Stopwatch:
     planner = getattr(agent, "planner", None)
     if planner is not None:
         stopwatch.watch(planner.model._engine, "step", "simulate")
-        functions = planner._functions
-        planner._functions = functions._replace(
-            policy=stopwatch.wrap(functions.policy, "networks in search"),
-            value=stopwatch.wrap(functions.value, "networks in search"),
-        )
+        make_functions = planner.functions
+
+        def timed_functions() -> Any:
+            functions = make_functions()
+            return functions._replace(
+                policy=stopwatch.wrap(functions.policy, "networks in search"),
+                value=stopwatch.wrap(functions.value, "networks in search"),
+            )
+
+        planner.functions = timed_functions
     return stopwatch
 
 
