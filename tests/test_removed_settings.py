@@ -1,10 +1,13 @@
 """Settings that there once were, or were keywords themselves: refused by name, and older files load."""
 
+import sys
+import warnings
+from copy import deepcopy
 from pathlib import Path
 
 import pytest
 
-from sb3_mcbs import MCBSTD3, BeamSettings, CEMSettings, SearchPolicy
+from sb3_mcbs import MCBSSAC, MCBSTD3, BeamSettings, CEMSettings, SearchPolicy
 from sb3_mcbs.agents import EnsembleSettings, ScheduleSettings
 from sb3_mcbs.agents.hyperparameters import MOVED, REMOVED, SETTINGS
 from sb3_mcbs.checkpoints import CheckpointError
@@ -14,7 +17,7 @@ from sb3_mcbs.checkpoints.settings import make_agent as make_agent_again
 from sb3_mcbs.search import PRESETS
 from sb3_mcbs.search.settings import STRATEGIES
 from sb3_mcbs.zoo.manager import _checked_search_evaluation
-from tests.conftest import SEARCHING, snapshot_vec_env
+from tests.conftest import SEARCHING, SMALL, snapshot_vec_env
 from tests.zoo_helpers import zoo_train
 
 TINY = ("policy_kwargs:dict(net_arch=[16,16])", "buffer_size:1000", "learning_starts:100")
@@ -174,3 +177,53 @@ def test_in_a_file_of_hyperparameters(
     )
     with pytest.raises(TypeError, match=words):
         zoo_train(monkeypatch, tmp_path, "mcbs_td3", "-conf", str(file), "-n", "101")
+
+
+@pytest.mark.parametrize(
+    "cls, file, strategy, group",
+    [
+        (MCBSTD3, "td3_refine", "cem", {"n_rounds": 2, "proposal_dims": 1}),
+        (MCBSSAC, "sac_tree", "tree", {"branching": 2}),
+    ],
+)
+def test_agents_that_were_saved_with_flat_settings_and_other_modules_go_on(cls, file, strategy, group):
+    path = Path(__file__).parent / "agents_of_before" / file
+    with warnings.catch_warnings(record=True):  # of the old name of a strategy
+        agent = cls.load(path, env=snapshot_vec_env("Pendulum-v1"))
+    assert (agent.strategy, agent.search_kwargs, agent.model_kwargs) == (strategy, group, {"n_threads": 1})
+    assert agent.learn(30, reset_num_timesteps=False).n_decisions == 70
+    assert "sb3_mcbs.algorithms" not in sys.modules
+
+
+def test_a_class_of_the_users_has_parameters_that_were_once_ours():
+    class WithThreads(MCBSTD3):
+        def __init__(self, *args, n_threads=2, **kwargs):
+            self.n_threads = n_threads
+            super().__init__(*args, model_kwargs={"n_threads": n_threads}, **kwargs)
+
+    agent = WithThreads("MlpPolicy", "Pendulum-v1", n_threads=1, **deepcopy(SMALL))
+    assert agent.search_settings.n_threads == agent.n_threads == 1
+
+
+def test_a_wrong_value_does_not_stay_where_a_class_has_a_default_of_its_own():
+    class Wide(MCBSTD3):
+        beam_width = 4
+
+    agent = Wide("MlpPolicy", "Pendulum-v1", **deepcopy(SMALL))
+    with pytest.raises(ValueError, match="beam_width"):
+        agent.beam_width = -3
+    assert agent.beam_width == 6
+
+
+def test_loading_with_what_stands_for_the_default(make_agent, tmp_path):
+    make_agent().save(tmp_path / "agent")
+    assert MCBSTD3.load(tmp_path / "agent", beam_width=None).beam_width == 3
+    objects = {"preset": "balanced", "beam_width": 20}
+    assert MCBSTD3.load(tmp_path / "agent", custom_objects=objects).beam_width == 20
+
+
+def test_settings_without_a_replay_buffer(make_agent):
+    agent = make_agent()
+    agent.replay_buffer = None
+    agent.beam_width = 4
+    assert agent.search_settings.beam_width == 4

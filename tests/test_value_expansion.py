@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
@@ -235,3 +236,21 @@ def test_soft_actions_and_their_entropy_are_sb3s(make_agent, cls, sde, ent_coef)
     np.testing.assert_allclose(actions.mean(axis=0), theirs.detach().mean(dim=0), atol=0.05)
     np.testing.assert_allclose(actions.std(axis=0), theirs.detach().std(dim=0), atol=0.05)
     assert bonus.mean() == pytest.approx(-0.2 * log_prob.mean().item(), abs=0.05)
+
+
+def test_rows_that_somebody_else_adds_are_not_expanded(make_agent):
+    agent = make_agent("InvertedPendulum-v5", value_expansion=2, expanded_share=1.0)
+    agent.env.reset()
+    row = np.zeros((1, 4), dtype=np.float32)
+    for _ in range(20):
+        agent.replay_buffer.add(row, row, np.zeros((1, 1)), np.ones(1), [False], [{}])
+    assert not agent.replay_buffer.expansion_held.any()
+    assert (agent.replay_buffer.sample(16).rewards == 1).all()
+
+
+def test_a_replay_buffer_is_handed_on_to_an_agent_without_expansion(make_agent):
+    expanding, plain = make_agent("InvertedPendulum-v5", value_expansion=2), make_agent("InvertedPendulum-v5")
+    plain.replay_buffer = expanding.learn(40).replay_buffer
+    plain.learn(30)
+    assert type(plain.replay_buffer) is ReplayBuffer and plain.replay_buffer.pos == 70
+    assert not hasattr(plain.replay_buffer, "expansion_states")

@@ -1,6 +1,10 @@
 """The settings of the search, and of what is learned from it: parameters of constructors, then attributes."""
 
-from collections.abc import Mapping
+import importlib
+import inspect
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import fields
 from typing import Any, Self
@@ -35,7 +39,7 @@ SETTINGS: dict[str, Any] = {
 }
 GROUPS = ("search_kwargs", "schedule_kwargs", "model_kwargs")
 #: Settings of presets: their default in the constructors is ``None``, which means not given.
-_OF_PRESETS = ("beam_width", "rollout_depth", "n_simulations", "beam_noise", "strategy")
+OF_PRESETS = ("beam_width", "rollout_depth", "n_simulations", "beam_noise", "strategy")
 
 #: Removed settings: their former default, and the reason or replacement.
 REMOVED: dict[str, tuple[Any, str]] = {
@@ -55,14 +59,27 @@ MOVED: dict[str, str] = {
     **dict.fromkeys(("n_threads", "ensemble_size", "ensemble_train_freq"), "model_kwargs"),
     **dict.fromkeys(("ensemble_gradient_steps", "ensemble_max_error", "ensemble_pessimism"), "model_kwargs"),
 }
+#: Modules whose objects are part of saved agents: where they once were, and where they are.
+_MOVED_MODULES = {
+    "sb3_mcbs.algorithms": "sb3_mcbs.agents",
+    "sb3_mcbs.algorithms.learned_model": "sb3_mcbs.agents.learned_model",
+    "sb3_mcbs.search.schedule": "sb3_mcbs.agents.schedule",
+    "sb3_mcbs.search.saturation": "sb3_mcbs.agents.saturation",
+    "sb3_mcbs.search.directions": "sb3_mcbs.search.proposals",
+}
 
 
 class RefusesOldNames:
     """Refuses removed and moved settings in the constructor, and names the replacement."""
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
-        refuse_old_names(kwargs)
+        refuse_old_names({name: value for name, value in kwargs.items() if not _is_own(cls, name)})
         return super().__new__(cls)
+
+
+def _is_own(cls: type, name: str) -> bool:
+    """Whether the constructor of a user's class has a parameter that was once one of ours."""
+    return name in inspect.signature(cls.__init__).parameters  # type: ignore[misc]
 
 
 def sb3_arguments(arguments: Mapping[str, Any]) -> dict[str, Any]:
@@ -84,7 +101,7 @@ def complete_settings(arguments: Mapping[str, Any]) -> dict[str, Any]:
     :raises ValueError: if there is no such preset.
     """
     given = {name: value for name, value in arguments.items() if name in SETTINGS}
-    for name in _OF_PRESETS:
+    for name in OF_PRESETS:
         if given.get(name) is None:
             given.pop(name, None)
     return tidied({**SETTINGS, **with_preset(given.get("preset"), given)})
@@ -137,7 +154,9 @@ def convert_older(agent: Any) -> None:
                 f"on without it: load(..., custom_objects={{{name!r}: {default!r}}})."
             )
         attributes.pop(name, None)
+    own = {name: attributes.pop(name) for name in MOVED if name in attributes and _is_own(type(agent), name)}
     group_flat(attributes)
+    attributes.update(own)
     for name, default in SETTINGS.items():
         # An agent that was saved before a setting existed has its default.
         if not hasattr(agent, name):
@@ -185,6 +204,20 @@ def settings_of_preset(name: str) -> dict[str, Any]:
     return settings
 
 
+@contextmanager
+def moved_modules() -> Iterator[None]:
+    """Let agents be unpickled that were saved before their modules were moved."""
+    added = {
+        old: importlib.import_module(new) for old, new in _MOVED_MODULES.items() if old not in sys.modules
+    }
+    sys.modules.update(added)
+    try:
+        yield
+    finally:
+        for old in added:
+            del sys.modules[old]
+
+
 class SearchAttributes(RefusesOldNames):
     """:data:`~sb3_mcbs.agents.hyperparameters.SETTINGS` as attributes of an agent.
 
@@ -220,11 +253,11 @@ class SearchAttributes(RefusesOldNames):
     _followed: list[dict[str, Any] | None]
 
     def __setattr__(self, name: str, value: Any) -> None:
-        if name in REMOVED or name in MOVED:
+        if (name in REMOVED or name in MOVED) and not _is_own(type(self), name):
             refuse_old_names({name: value})
         if name not in SETTINGS or not self._is_set_up:
             super().__setattr__(name, value)
-        elif hasattr(type(self), name):  # a property of a class of the user's
+        elif isinstance(getattr(type(self), name, None), property):  # a property of a class of the user's
             super().__setattr__(name, value)
             self._follow_settings()
         elif name == "preset" and value is not None:

@@ -18,10 +18,12 @@ from sb3_mcbs.agents.faults import environment_named
 from sb3_mcbs.agents.hyperparameters import (
     GROUPS,
     MOVED,
+    OF_PRESETS,
     SETTINGS,
     SearchAttributes,
     complete_settings,
     convert_older,
+    moved_modules,
     refuse_old_names,
     settings_of_preset,
     tidied,
@@ -59,7 +61,8 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
                     self._setup_model()
 
     A subclass lists :data:`~sb3_mcbs.agents.hyperparameters.SETTINGS` in its signature, and keeps them as
-    attributes, as SB3 does with its own.
+    attributes, as SB3 does with its own. With further parameters it calls SB3's constructor without
+    ``sb3_arguments``.
     """
 
     #: Attributes that neither ``save`` nor exact checkpoints contain, and why.
@@ -165,8 +168,12 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
         normalizer = unwrap_vec_normalize(env)
         normalize_reward = normalizer is not None and normalizer.norm_reward
         self.planner = Planner(self, env, settings, normalize_reward, self.recent_actions)
-        self._check_states()
-        self._expand_buffer()
+        try:
+            self._check_states()
+            self._expand_buffer()
+        except Exception:
+            self.planner.close()
+            raise
         if before is not None:
             before.close()
         self._say_what_simulates()
@@ -190,7 +197,7 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
         # As with SB3's agents, networks and environments are shared with the original. Settings are not.
         made = type(self).__new__(type(self))
         vars(made).update(vars(self))
-        for name in ("_schedule", "planner", *GROUPS):
+        for name in {"_schedule", "planner", *GROUPS} & vars(self).keys():
             vars(made)[name] = copy(vars(self)[name])
         if made.planner is not None:
             made.planner.agent = made
@@ -393,14 +400,19 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
             settings of the search that are not given explicitly
         :return: the model
         """
+        kwargs = {
+            name: value for name, value in kwargs.items() if value is not None or name not in OF_PRESETS
+        }
         objects = kwargs.get("custom_objects") or {}
         refuse_old_names({**{name: objects[name] for name in MOVED.keys() & objects.keys()}, **kwargs})
         preset = kwargs.get("preset", objects.get("preset"))
         if preset is not None:
-            kwargs = merged(settings_of_preset(preset), kwargs)
+            beside = {name: objects[name] for name in SETTINGS.keys() & objects.keys()}
+            kwargs = merged(settings_of_preset(preset), {**beside, **kwargs})
         # Older files have the keys of these as attributes, which None would leave in place.
         kwargs = {name: {} if name in GROUPS and value is None else value for name, value in kwargs.items()}
-        return super().load(path, *args, **kwargs)
+        with moved_modules():
+            return super().load(path, *args, **kwargs)
 
     @classmethod
     def resume(cls: type[SelfMCBS], path: str, env: GymEnv | None = None, **kwargs: Any) -> SelfMCBS:

@@ -137,9 +137,14 @@ class Planner:
         directions = None if dims is None else self.recent_actions.directions(dims)
         with one_thread(), matmul_precision(settings.matmul_precision):
             if not isinstance(settings, BeamSettings) or settings.time_budget is None:
-                plans = self._recall(envs, settings)
-                result = search(roots, functions, settings, rng, directions, plans)
-                self._keep(result, envs)
+                if self._warm_start is None:
+                    result = search(roots, functions, settings, rng, directions)
+                else:
+                    clocks = self._clocks(envs)
+                    plans = self._warm_start.recall(envs, clocks, settings.noise_hold)
+                    result = search(roots, functions, settings, rng, directions, plans)
+                    assert result.plans is not None
+                    self._warm_start.keep(result.plans, envs, clocks)
             else:
                 deadline = start + settings.time_budget
                 forecast = self._forecasts[n_rows(roots.observations), settings.rollout_depth]
@@ -349,15 +354,6 @@ class Planner:
         if known is not None and settings.horizon == self.settings.horizon:
             return known
         return WarmStart(self._vec_env.num_envs, settings.horizon, self._act_dim)
-
-    def _recall(self, envs: Sequence[int], settings: SearchSettings) -> np.ndarray | None:
-        if self._warm_start is None:
-            return None
-        return self._warm_start.recall(envs, self._clocks(envs), settings.noise_hold)
-
-    def _keep(self, result: SearchResult, envs: Sequence[int]) -> None:
-        if self._warm_start is not None and result.plans is not None:
-            self._warm_start.keep(result.plans, envs, self._clocks(envs))
 
     def _clocks(self, envs: Sequence[int] | None = None) -> list[EpisodeClock]:
         assert self.source is not None

@@ -106,17 +106,19 @@ class ExpandedReplayBuffer(ReplayBuffer):
     episode ended). :func:`expand` converts a replay buffer of any class. It is pickled as that class, so it
     can be loaded without this package.
 
-    :ivar agent: the :class:`~sb3_mcbs.MCBS` agent that learns from it; simulated steps are added to its
-        ``n_simulated_steps``.
+    :ivar expanding_agent: the :class:`~sb3_mcbs.MCBS` agent that learns from it. Simulated steps are added
+        to its ``n_simulated_steps``.
     :ivar expansion_states: ``[buffer_size, n_envs, state_size]``, the state after each step.
     :ivar expansion_held: ``[buffer_size, n_envs]`` bool, whether that state is stored.
     """
 
     #: Its class without expansion.
     base_class: ClassVar[type[ReplayBuffer]]
-    not_checkpointed = ("agent",)
+    not_checkpointed = ("expanding_agent", "states_after")
 
-    agent: Any
+    expanding_agent: Any
+    #: States of the environments after the step that is added next; None for rows of others.
+    states_after: np.ndarray | None = None
     expansion_states: np.ndarray
     expansion_held: np.ndarray
 
@@ -133,8 +135,10 @@ class ExpandedReplayBuffer(ReplayBuffer):
 
         :param done: ``[n_envs]``, whether the episode ended: the state is then of the next one.
         """
-        self.expansion_states[self.pos] = batched_states(self.agent)
-        self.expansion_held[self.pos] = ~done.astype(bool)
+        states, self.states_after = self.states_after, None
+        self.expansion_held[self.pos] = False if states is None else ~np.asarray(done, dtype=bool)
+        if states is not None:
+            self.expansion_states[self.pos] = states
         super().add(obs, next_obs, action, reward, done, infos)
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> Any:
@@ -144,7 +148,7 @@ class ExpandedReplayBuffer(ReplayBuffer):
         :param env: normalises observations and rewards.
         :return: n-step transitions. Those that ended an episode are not expanded.
         """
-        agent = self.agent
+        agent = self.expanding_agent
         n_expanded = round(agent.expanded_share * batch_size)
         samples = []
         if n_expanded < batch_size:
@@ -194,7 +198,7 @@ class ExpandedReplayBuffer(ReplayBuffer):
         :param env: normalises observations and rewards.
         """
         returns, lengths, terminated, last = path
-        agent, planner = self.agent, self.agent.planner
+        agent, planner = self.expanding_agent, self.expanding_agent.planner
         model, view = planner.model, planner.source.view
         model.set_roots(list(states), np.arange(len(going)), rng)
         seen: Any = self._normalize_obs(take_rows(last, going), env)
@@ -232,12 +236,12 @@ class ExpandedReplayBuffer(ReplayBuffer):
             map_arrays(self.to_torch, last),
             self.to_torch(path.terminated.astype(np.float32)[:, None]),
             self.to_torch(path.returns.astype(np.float32)[:, None]),
-            self.to_torch((self.agent.gamma**path.lengths).astype(np.float32)[:, None]),
+            self.to_torch((self.expanding_agent.gamma**path.lengths).astype(np.float32)[:, None]),
         )
 
     def __reduce_ex__(self, protocol: Any) -> Any:
         held: Any = self.__getstate__()
-        state = {name: value for name, value in held.items() if name != "agent"}
+        state = {name: value for name, value in held.items() if name not in self.not_checkpointed}
         return object.__new__, (self.base_class,), state
 
 
@@ -257,7 +261,7 @@ def expand(buffer: ReplayBuffer, agent: Any) -> None:
             held.expansion_states = np.zeros(shape)
             held.expansion_held = np.zeros(shape[:2], dtype=bool)
         held.__class__ = _expanded_class(type(buffer))
-    vars(buffer)["agent"] = agent
+    vars(buffer)["expanding_agent"] = agent
 
 
 @functools.cache
@@ -270,6 +274,11 @@ def drop_states(buffer: ReplayBuffer | None) -> None:
 
     :param buffer: the replay buffer.
     """
+    if buffer is None:
+        return
+    if isinstance(buffer, ExpandedReplayBuffer):
+        del buffer.expanding_agent
+        buffer.__class__ = buffer.base_class  # type: ignore[assignment]
     kept = [name for name in ARRAYS if name in vars(buffer)]
     for name in kept:
         delattr(buffer, name)
@@ -364,8 +373,8 @@ class Expanding(CheckedRollouts):
     def _check_expansion(self, settings: SearchSettings) -> None:
         expansion = ValueExpansionSettings.of(self)
         expansion.check_search(settings)
-        assert self.replay_buffer is not None
-        expansion.check_buffer(self.replay_buffer.optimize_memory_usage)
+        if self.replay_buffer is not None:  # it may have been taken away
+            expansion.check_buffer(self.replay_buffer.optimize_memory_usage)
 
     def _check_states(self) -> None:
         """Refuse a forward model whose states cannot be kept."""
@@ -408,3 +417,9 @@ class Expanding(CheckedRollouts):
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
         self._expand_buffer()
         super().train(gradient_steps, batch_size)
+
+    def _store_valid_transition(self, *transition: Any) -> None:
+        if self.value_expansion:
+            buffer: ExpandedReplayBuffer = transition[0]
+            buffer.states_after = batched_states(self)
+        super()._store_valid_transition(*transition)
