@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -16,8 +15,6 @@ from sb3_mcbs.experiments.results import FINISHED, RunFolder
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
 #: Of prctl: the signal that a process gets when its parent ends.
 _PR_SET_PDEATHSIG = 1
-#: Seconds over which the speed of a run is taken.
-_WINDOW = 60.0
 
 
 def command(folder: RunFolder) -> list[str]:
@@ -58,7 +55,8 @@ class Job:
         self.exit_status: int | None = None
         self.progress: dict[str, Any] = folder.progress
         self._process: subprocess.Popen | None = None
-        self._times: deque[tuple[float, int]] = deque()
+        #: When it began and when it was last seen, and its steps then.
+        self._times: list[tuple[float, int]] = []
 
     def start(self, argv: Sequence[str]) -> None:
         """
@@ -134,8 +132,7 @@ class Job:
         if self._times and self.step < self._times[-1][1]:  # a checkpoint lies before what was done
             self._times.clear()
         self._times.append((time.monotonic(), self.step))
-        while len(self._times) > 2 and self._times[0][0] < time.monotonic() - _WINDOW:
-            self._times.popleft()
+        del self._times[1:-1]
         return self.progress.get("evaluations", 0) > before.get("evaluations", 0)
 
     @property
@@ -150,7 +147,7 @@ class Job:
 
     @property
     def steps_per_second(self) -> float | None:
-        """Over the last minute, evaluations included; None as long as nobody knows."""
+        """On average since it was started, evaluations included; None as long as nobody knows."""
         if self.state != "running" or len(self._times) < 2:
             return None
         (then, before), (now, step) = self._times[0], self._times[-1]
