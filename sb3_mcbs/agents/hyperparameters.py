@@ -3,7 +3,7 @@
 import importlib
 import inspect
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import fields
@@ -59,6 +59,7 @@ MOVED: dict[str, str] = {
     **dict.fromkeys(("n_threads", "ensemble_size", "ensemble_train_freq"), "model_kwargs"),
     **dict.fromkeys(("ensemble_gradient_steps", "ensemble_max_error", "ensemble_pessimism"), "model_kwargs"),
 }
+OLD_NAMES = frozenset({*REMOVED, *MOVED})
 #: Modules whose objects are part of saved agents: where they once were, and where they are.
 _MOVED_MODULES = {
     "sb3_mcbs.algorithms": "sb3_mcbs.agents",
@@ -73,13 +74,20 @@ class RefusesOldNames:
     """Refuses removed and moved settings in the constructor, and names the replacement."""
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
-        refuse_old_names({name: value for name, value in kwargs.items() if not _is_own(cls, name)})
+        refuse_old_names(kwargs, cls)
         return super().__new__(cls)
 
 
-def _is_own(cls: type, name: str) -> bool:
-    """Whether the constructor of a user's class has a parameter that was once one of ours."""
-    return name in inspect.signature(cls.__init__).parameters  # type: ignore[misc]
+def _old_names(names: Iterable[str], cls: type | None = None) -> set[str]:
+    """Find the names of settings that were removed or moved.
+
+    :param names: any names.
+    :param cls: a class whose constructor may have parameters of such names itself.
+    """
+    found = OLD_NAMES.intersection(names)
+    if found and cls is not None:
+        found = found.difference(inspect.signature(cls.__init__).parameters)  # type: ignore[misc]
+    return set(found)
 
 
 def sb3_arguments(arguments: Mapping[str, Any]) -> dict[str, Any]:
@@ -123,17 +131,19 @@ def tidied(settings: Mapping[str, Any]) -> dict[str, Any]:
     return kept
 
 
-def refuse_old_names(names: Mapping[str, Any]) -> None:
+def refuse_old_names(names: Mapping[str, Any], cls: type | None = None) -> None:
     """Refuse settings that were removed or moved into a dictionary.
 
     :param names: settings by name.
+    :param cls: a class whose constructor may have parameters of such names itself.
     :raises TypeError: names them and their replacement.
     """
-    removed = [f"{name} was removed: {REMOVED[name][1]}" for name in names if name in REMOVED]
+    old = _old_names(names, cls)
+    removed = [f"{name} was removed: {REMOVED[name][1]}" for name in names if name in old & REMOVED.keys()]
     if removed:
         raise TypeError("; ".join(removed) + ". Leave it out.")
     for group in GROUPS:
-        moved = {name: value for name, value in names.items() if MOVED.get(name) == group}
+        moved = {key: value for key, value in names.items() if key in old and MOVED.get(key) == group}
         if moved:
             verb = "is" if len(moved) == 1 else "are"
             raise TypeError(f"{', '.join(moved)} {verb} now part of {group}: write {group}={moved!r}.")
@@ -154,7 +164,8 @@ def convert_older(agent: Any) -> None:
                 f"on without it: load(..., custom_objects={{{name!r}: {default!r}}})."
             )
         attributes.pop(name, None)
-    own = {name: attributes.pop(name) for name in MOVED if name in attributes and _is_own(type(agent), name)}
+    of_its_class = attributes.keys() & MOVED.keys() - _old_names(MOVED, type(agent))
+    own = {name: attributes.pop(name) for name in of_its_class}
     group_flat(attributes)
     attributes.update(own)
     for name, default in SETTINGS.items():
@@ -253,8 +264,8 @@ class SearchAttributes(RefusesOldNames):
     _followed: list[dict[str, Any] | None]
 
     def __setattr__(self, name: str, value: Any) -> None:
-        if (name in REMOVED or name in MOVED) and not _is_own(type(self), name):
-            refuse_old_names({name: value})
+        if name in OLD_NAMES:
+            refuse_old_names({name: value}, type(self))
         if name not in SETTINGS or not self._is_set_up:
             super().__setattr__(name, value)
         elif isinstance(getattr(type(self), name, None), property):  # a property of a class of the user's

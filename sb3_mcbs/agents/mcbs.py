@@ -449,12 +449,3 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
     def _excluded_save_params(self) -> list[str]:
         # learn() makes the noise again; exact checkpoints, taken during learn(), need it.
         return [*super()._excluded_save_params(), *MCBS.not_checkpointed, "_noise_without_search"]
-
-    def _search_memory(self) -> dict[str, Any]:
-        assert self.planner is not None
-        return self.planner.memory
-
-    def _go_on_searching(self, memory: dict[str, Any]) -> None:
-        self._follow_settings()  # callbacks may have changed them
-        assert self.planner is not None
-        self.planner.memory = memory

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.preprocessing import get_action_dim
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_mcbs.agents.faults import InvalidDecisions, check_networks, is_finite
 from sb3_mcbs.agents.observation_pipeline import reward_normalizer
@@ -256,9 +256,7 @@ class Planner:
         """
         if normalize != self.normalize_reward and self.source is not None:
             self.normalize_reward = normalize
-            self.source.view.reward_normalizer = reward_normalizer(
-                self.agent.get_env(), self._vec_env, normalize
-            )
+            self.source.view.reward_normalizer = self._reward_normalizer()
 
     def check_networks(self, observations: Observations) -> None:
         """Check whether the networks have diverged.
@@ -340,12 +338,15 @@ class Planner:
     def _make_source(self, settings: SearchSettings) -> RootSource | None:
         if settings.rollout_depth == 0:
             return None
-        normalizer = reward_normalizer(self.agent.get_env(), self._vec_env, self.normalize_reward)
+        normalizer = self._reward_normalizer()
         # A copy makes its source later, when the environments may have changed.
         self.normalize_reward = normalizer is not None
         if settings.forward_model == "ensemble":
             return LearnedRoots(self.agent, self._vec_env, settings, normalizer)
         return ExactRoots(self._vec_env, settings, normalizer)
+
+    def _reward_normalizer(self) -> VecNormalize | None:
+        return reward_normalizer(self.agent.get_env(), self._vec_env, self.normalize_reward)
 
     def _make_warm_start(self, settings: SearchSettings) -> WarmStart | None:
         if not isinstance(settings, CEMSettings):

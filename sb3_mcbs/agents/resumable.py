@@ -40,15 +40,22 @@ class Resumable(OffPolicyAlgorithm):
 
 
 class Searching(ABC):
-    """An object whose search has a memory besides its attributes."""
+    """An object whose search has a memory besides its attributes: that of its planner."""
+
+    planner: Any
 
     @abstractmethod
+    def _follow_settings(self) -> None:
+        """Use the current settings from the next decision on."""
+
     def _search_memory(self) -> dict[str, Any]:
         """Return the memory of the search."""
+        return self.planner.memory
 
-    @abstractmethod
     def _go_on_searching(self, memory: dict[str, Any]) -> None:
         """Restore the memory of the search, after all attributes are restored.
 
         :param memory: from :meth:`_search_memory`.
         """
+        self._follow_settings()  # callbacks may have changed them
+        self.planner.memory = memory

@@ -76,6 +76,7 @@ class RootSource(ABC):
     model: ForwardModel
     view: ObservationPipeline
     settings: SearchSettings
+    _previous_step_differed = False
 
     @property
     def ready(self) -> bool:
@@ -121,12 +122,17 @@ class RootSource(ABC):
         return {
             "kind": self.model.kind,
             "deterministic": self.model.deterministic,
-            "previous_step_differed": False,
+            "previous_step_differed": self._previous_step_differed,
         }
 
     @memory.setter
     def memory(self, memory: dict[str, Any]) -> None:
+        self._previous_step_differed = memory["previous_step_differed"]
+        self._go_on_with(memory["kind"])
         self.model.deterministic = memory["deterministic"]
+
+    def _go_on_with(self, kind: str) -> None:  # noqa: B027
+        """Simulate with the kind of forward model that was there before."""
 
 
 class ExactRoots(RootSource):
@@ -144,7 +150,6 @@ class ExactRoots(RootSource):
         self.environments = snapshot_environments(self.view.base)
         self.model = make_forward_model(self.environments, settings.forward_model, settings.n_threads)
         self.settings = settings
-        self._previous_step_differed = False
 
     def capture_roots(self, observations: Observations, envs: Sequence[int]) -> Roots:
         states = self.read_states(envs)
@@ -247,22 +252,11 @@ class ExactRoots(RootSource):
         self.model.close()
         self.model = make_forward_model(self.environments, kind, self.settings.n_threads)
 
-    @property
-    def memory(self) -> dict[str, Any]:
-        return {
-            "kind": self.model.kind,
-            "deterministic": self.model.deterministic,
-            "previous_step_differed": self._previous_step_differed,
-        }
-
-    @memory.setter
-    def memory(self, memory: dict[str, Any]) -> None:
-        self._previous_step_differed = memory["previous_step_differed"]
-        if self.model.kind != memory["kind"]:
-            self._simulate_with(memory["kind"])
+    def _go_on_with(self, kind: str) -> None:
+        if self.model.kind != kind:
+            self._simulate_with(kind)
         elif self.model.kind != "pool":
             self.model.refresh()  # the environments' simulators have other values than when it was made
-        self.model.deterministic = memory["deterministic"]
 
 
 class LearnedRoots(RootSource):

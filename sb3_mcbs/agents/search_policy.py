@@ -24,13 +24,11 @@ from sb3_mcbs.agents.mcbs import MCBS
 from sb3_mcbs.agents.planner import Planner
 from sb3_mcbs.agents.resumable import Searching
 from sb3_mcbs.search import SearchResult, SearchSettings, make_settings, with_preset
-from sb3_mcbs.search.settings import merged
+from sb3_mcbs.search.settings import KEYWORDS, merged
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 
 #: Attributes with special handling when they are set.
 _HELD = ("model", "vec_env", "settings", "preset")
-#: Settings that are attributes.
-_OWN = (*SearchSettings.flat, "strategy", "search_kwargs", "model_kwargs")
 
 
 class SearchPolicy(RefusesOldNames, Searching):
@@ -97,7 +95,7 @@ class SearchPolicy(RefusesOldNames, Searching):
         matmul_precision: str | None = None,
     ) -> None:
         arguments = locals()
-        given = {name: arguments[name] for name in _OWN if arguments[name] is not None}
+        given = {name: arguments[name] for name in KEYWORDS if arguments[name] is not None}
         if normalize_reward is not None and not isinstance(normalize_reward, bool):
             raise TypeError(f"normalize_reward must be True, False or None, got {normalize_reward!r}.")
         self.model = model
@@ -126,7 +124,7 @@ class SearchPolicy(RefusesOldNames, Searching):
             if value is not None:
                 self._change(settings_of_preset(value))
             attributes["preset"] = value
-        elif name in _OWN:
+        elif name in KEYWORDS:
             changes = {name: value}
             if changes == {"rollout_depth": 0} and self.settings.forward_model == "ensemble":
                 changes["forward_model"] = "auto"  # nothing is simulated
@@ -147,7 +145,7 @@ class SearchPolicy(RefusesOldNames, Searching):
         return made
 
     def _change(self, changes: dict[str, Any]) -> None:
-        own = {name: value for name, value in changes.items() if name in _OWN}
+        own = {name: value for name, value in changes.items() if name in KEYWORDS}
         self.settings = make_settings(**{**self.settings.grouped(), **own})
 
     def _change_settings(self, settings: SearchSettings) -> None:
@@ -181,12 +179,8 @@ class SearchPolicy(RefusesOldNames, Searching):
         actions = self.planner.unscale(self.last_result.actions)
         return (actions[0] if is_single else actions), state
 
-    def _search_memory(self) -> dict[str, Any]:
-        return self.planner.memory
-
-    def _go_on_searching(self, memory: dict[str, Any]) -> None:
+    def _follow_settings(self) -> None:
         self.planner.follow(self.settings)
-        self.planner.memory = memory
 
     def close(self) -> None:
         """Release the forward model. The agent and the environment stay open."""
@@ -195,7 +189,7 @@ class SearchPolicy(RefusesOldNames, Searching):
     def __getattr__(self, name: str) -> Any:
         if name in ("model", "settings") or name.startswith("__"):
             raise AttributeError(name)
-        if name not in _OWN:
+        if name not in KEYWORDS:
             return getattr(self.model, name)
         value = self.settings.grouped()[name]
         return MappingProxyType(value) if isinstance(value, dict) else value

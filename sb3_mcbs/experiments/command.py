@@ -2,7 +2,6 @@
 
 import argparse
 import fnmatch
-import os
 import sys
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from sb3_mcbs.experiments.local import LocalEngine
 from sb3_mcbs.experiments.plan import Run, expand
 from sb3_mcbs.experiments.results import ResultsError, prepare
 from sb3_mcbs.experiments.spec import SPECS, SpecError, read_spec
+from sb3_mcbs.models.mujoco_batch import usable_cores
 
 
 def main() -> None:
@@ -48,16 +48,14 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("spec", help=f"a YAML file, or a shipped spec: {shipped}")
     parser.add_argument("-o", "--output", type=Path, help="folder of the results (logs/experiments/SPEC)")
-    parser.add_argument("-j", "--jobs", type=int, default=_cores(), help="runs at a time (%(default)s here)")
+    parser.add_argument(
+        "-j", "--jobs", type=int, default=usable_cores(), help="runs at a time (%(default)s here)"
+    )
     parser.add_argument(
         "--only", metavar="PATTERN", help="runs whose name has this in it, or matches it with *"
     )
     parser.add_argument("--check", "--dry-run", action="store_true", help="check the spec and list its runs")
     return parser
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _matching(runs: list[Run], pattern: str | None) -> list[Run]:

@@ -32,8 +32,7 @@ def evaluate_agent(folder: RunFolder) -> None:
         result = getattr(policy, "last_result", None)
         steps.append(0 if result is None else int(result.simulated_steps))
 
-    first = run.evaluation.first_seed
-    seeds = list(range(first, first + run.evaluation.episodes))
+    seeds = run.evaluation.seeds
     episodes: list[tuple[float, int]] = []
     started = time.perf_counter()
     for seed in seeds:

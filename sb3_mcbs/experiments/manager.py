@@ -38,8 +38,7 @@ class RunManager(MCBSExperimentManager):
         searches = self.algo in SEARCHING
         labels = ["actor", "search"] if searches or self.search_evaluation is not None else ["actor"]
         own = "search" if searches else "actor"
-        first = self.run.evaluation.first_seed
-        seeds = list(range(first, first + self.run.evaluation.episodes))
+        seeds = self.run.evaluation.seeds
         policies = []
         for label in labels:
             is_other = label == "search" and not searches

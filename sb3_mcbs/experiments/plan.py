@@ -75,8 +75,9 @@ def expand(spec: Spec) -> list[Run]:
     :return: its runs
     :raises SpecError: if there are no hyperparameters for one of them
     """
+    files = {arm.algorithm: _read_file(spec, arm.algorithm) for arm in spec.arms if spec.environments}
     runs = [
-        _run(spec, arm, environment, seed)
+        _run(spec, arm, environment, seed, files[arm.algorithm])
         for seed in spec.seeds
         for environment in spec.environments
         for arm in spec.arms
@@ -94,9 +95,9 @@ def expand(spec: Spec) -> list[Run]:
     return runs
 
 
-def _run(spec: Spec, arm: Arm, environment: str, seed: int) -> Run:
-    path = spec.hyperparameters.get(arm.algorithm) or _usual_file(arm.algorithm)
-    entry, hyperparameters = _read_entry(path, arm.algorithm, environment)
+def _run(spec: Spec, arm: Arm, environment: str, seed: int, file: tuple[Path, dict[str, Any]]) -> Run:
+    path, entries = file
+    entry, hyperparameters = _entry_for(environment, path, entries)
     return Run(
         name=f"{arm.name}_{environment.replace('/', '-')}_{seed}",
         arm=arm.name,
@@ -137,18 +138,24 @@ def _usual_file(algorithm: str) -> Path:
         return Path(rl_zoo3.__file__).parent / "hyperparams" / f"{algorithm}.yml"
 
 
-def _read_entry(path: Path, algorithm: str, environment: str) -> tuple[str, dict[str, Any]]:
-    """The hyperparameters for an environment, or else for another version of it, or else the default ones.
-
-    RL Zoo's files know MuJoCo's environments by their v4 names only, and for another name it takes the
-    default without a word.
-    """
+def _read_file(spec: Spec, algorithm: str) -> tuple[Path, dict[str, Any]]:
+    """The file with an algorithm's hyperparameters, and what it says by environment."""
+    path = spec.hyperparameters.get(algorithm) or _usual_file(algorithm)
     try:
         entries = yaml.safe_load(path.read_text())
     except (OSError, yaml.YAMLError) as error:
         raise SpecError(f"No hyperparameters for {algorithm}: {path} cannot be read: {error}.") from error
     if not isinstance(entries, dict):
         raise SpecError(f"{path} must be a mapping of environments to hyperparameters.")
+    return path, entries
+
+
+def _entry_for(environment: str, path: Path, entries: dict[str, Any]) -> tuple[str, dict[str, Any]]:
+    """The hyperparameters for an environment, or else for another version of it, or else the default ones.
+
+    RL Zoo's files know MuJoCo's environments by their v4 names only, and for another name it takes the
+    default without a word.
+    """
     found = _VERSION.fullmatch(environment)
     versions = [
         (int(match[2]), name)

@@ -10,7 +10,7 @@ from typing import IO, Any
 
 import yaml
 
-from sb3_mcbs.checkpoints.store import STEP
+from sb3_mcbs.checkpoints.store import Store
 from sb3_mcbs.experiments.plan import Run, from_yaml
 from sb3_mcbs.experiments.spec import Spec
 from sb3_mcbs.zoo.manager import CHECKPOINTS
@@ -129,7 +129,7 @@ class RunFolder:
         :param run: what is trained here
         :return: whether there is an exact checkpoint to go on from
         """
-        return any((self.training(run) / CHECKPOINTS).glob(f"{STEP}*"))
+        return bool(Store(self.training(run) / CHECKPOINTS).steps())
 
     @property
     def status(self) -> dict[str, Any]:

@@ -37,6 +37,11 @@ class Evaluation:
     episodes: int
     first_seed: int = 10_000
 
+    @property
+    def seeds(self) -> list[int]:
+        """Of the episodes."""
+        return list(range(self.first_seed, self.first_seed + self.episodes))
+
 
 @dataclass(frozen=True)
 class Arm:

@@ -24,11 +24,9 @@ from sb3_mcbs.loading.architecture import Architecture, check_spaces, read_archi
 from sb3_mcbs.loading.archive import AgentFileError, about
 from sb3_mcbs.loading.network_settings import is_number, network_settings
 from sb3_mcbs.search import SearchSettings, make_settings
+from sb3_mcbs.search.settings import KEYWORDS
 
 logger = logging.getLogger("sb3_mcbs")
-
-#: What is taken over of the search; older files lack the last two.
-_SEARCH = (*SearchSettings.flat, "strategy", "search_kwargs", "model_kwargs")
 
 
 def load_agent(
@@ -129,12 +127,13 @@ def _numbers(file: AgentFile, algo: str, architecture: Architecture) -> tuple[di
             f"an integer from 0 to below the number of quantiles, {architecture.n_outputs}",
         )
     searches = "beam_width" in file.data and issubclass(ALGORITHMS[algo], MCBS)
-    names = (*checks, *(_SEARCH if searches else ()))
+    names = (*checks, *(KEYWORDS if searches else ()))
+    expected = (*checks, *SearchSettings.flat, "strategy")  # older files lack the dictionaries
     data = {name: value for name, value in file.data.items() if not is_pickled(value)}
     warnings = [
         f"{name} is not there as a plain value; the default is used. Set it on the agent."
         for name in (*names, *(MOVED if searches else ()))
-        if name not in data and (name in file.data or name in (*checks, *_SEARCH[:-2]))
+        if name not in data and (name in file.data or name in expected)
     ]
     for name, (check, words) in checks.items():
         if name in data and not check(data[name]):
@@ -148,7 +147,7 @@ def _numbers(file: AgentFile, algo: str, architecture: Architecture) -> tuple[di
                 for key, value in values["model_kwargs"].items()
                 if key not in EnsembleSettings.in_group()
             }
-        make_settings(**{name: value for name, value in values.items() if name in _SEARCH})
+        make_settings(**{name: value for name, value in values.items() if name in KEYWORDS})
     except (TypeError, ValueError, OverflowError) as reason:
         raise AgentFileError(f"search settings: {str(reason)[:300]}") from reason
     return values, warnings

@@ -30,9 +30,14 @@ _FIRST_CAPACITY = 32
 _OF_THE_PARENT: list[Engine] = []
 
 
+def usable_cores() -> int:
+    """How many processor cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def available_cpus() -> int:
-    """How many processors this process may use: no more than ``OMP_NUM_THREADS`` says to everybody else."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """How many threads may simulate: one per core, and no more than ``OMP_NUM_THREADS`` says to everybody."""
+    cores = usable_cores()
     wanted = os.environ.get("OMP_NUM_THREADS", "")
     return min(cores, int(wanted)) if wanted.isdecimal() and int(wanted) else cores
 

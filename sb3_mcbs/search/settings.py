@@ -240,6 +240,10 @@ class SearchSettings(CheckedSettings, ABC):
         return make_settings(**with_preset(name, changes))
 
 
+#: The keywords of an agent's constructor that are about the search: what :func:`make_settings` takes.
+KEYWORDS = (*SearchSettings.flat, "strategy", "search_kwargs", "model_kwargs")
+
+
 def make_settings(
     strategy: str = "beam",
     search_kwargs: Mapping[str, Any] | None = None,

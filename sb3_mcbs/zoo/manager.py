@@ -28,8 +28,8 @@ from sb3_mcbs.agents.schedule import SCHEDULES, UNITS
 from sb3_mcbs.checkpoints import CheckpointError, ExactCheckpointCallback
 from sb3_mcbs.checkpoints.resume import CheckpointedRun
 from sb3_mcbs.models import ForwardModelError
-from sb3_mcbs.search import PRESETS, SearchSettings, make_settings, with_preset
-from sb3_mcbs.search.settings import MATMUL_PRECISIONS, STRATEGIES, merged, present_name
+from sb3_mcbs.search import PRESETS, make_settings, with_preset
+from sb3_mcbs.search.settings import KEYWORDS, MATMUL_PRECISIONS, STRATEGIES, merged, present_name
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 from sb3_mcbs.types import BACKENDS
 from sb3_mcbs.zoo.callbacks import SearchEvalCallback, SecondEvalCallback
@@ -269,11 +269,10 @@ def _checked_search_evaluation(settings: Any, algo: str) -> dict[str, Any]:
     settings = dict(settings)
     settings = with_preset(settings.pop("preset", None), settings)
     refuse_old_names(settings)
-    known = (*SearchSettings.flat, "strategy", "search_kwargs", "model_kwargs")
-    unknown = sorted(set(settings) - set(known))
+    unknown = sorted(set(settings) - set(KEYWORDS))
     if unknown:
         raise ValueError(
-            f"search_evaluation has unknown settings: {', '.join(unknown)}. Known are: {', '.join(known)}."
+            f"search_evaluation has unknown settings: {', '.join(unknown)}. Known are: {', '.join(KEYWORDS)}."
         )
     make_settings(**settings)
     return settings
