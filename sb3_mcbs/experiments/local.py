@@ -80,10 +80,11 @@ class LocalEngine:
                 signal.signal(signum, handler)
 
     def _heed_signals(self) -> None:
-        if self._n_signals == self._n_heeded:
+        n_signals = self._n_signals  # read once: another one may come while this one is heeded
+        if n_signals == self._n_heeded:
             return
         running = self._of_state("running")
-        if self._n_heeded == 0 and self._n_signals == 1:
+        if self._n_heeded == 0 and n_signals == 1:
             self.display.say(
                 f"Stopping: {len(running)} runs write a checkpoint after their present step. "
                 "Once more to stop them at once."
@@ -93,7 +94,7 @@ class LocalEngine:
         else:
             for job in running:
                 job.kill()
-        self._n_heeded = self._n_signals
+        self._n_heeded = n_signals
 
     def _look_after(self) -> None:
         for job in self._of_state("running"):
