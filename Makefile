@@ -3,7 +3,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.sb3-mcbs-installed
 
-.PHONY: help install train test test-slow lint format evidence clean
+.PHONY: help install train test test-slow lint format clean
 .PHONY: bench-search bench-training bench-scaling bench-memory bench-deadline bench-gradient_step bench-kill bench-soak
 
 help:
@@ -13,7 +13,6 @@ help:
 	@echo "make lint       ruff and mypy"
 	@echo "make format     ruff format, and what ruff check can repair"
 	@echo "make bench-search and other measurements: see docs/speed.md and docs/checkpoints.md"
-	@echo "make evidence   TD3 against MCBS-TD3, three seeds each (two hours or more on two cores)"
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
@@ -43,9 +42,6 @@ lint: $(STAMP)
 format: $(STAMP)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
-
-evidence: $(STAMP)
-	$(BIN)/python benchmarks/first_evidence.py
 
 bench-search bench-scaling bench-memory bench-deadline bench-gradient_step bench-kill bench-soak: bench-%: $(STAMP)
 	$(BIN)/python -m benchmarks.$*

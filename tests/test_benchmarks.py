@@ -134,17 +134,3 @@ def test_scaling_and_memory_and_deadline(monkeypatch):
     assert len(memory.over_decisions(agent, 10, 5)) == 3
     assert len(memory.over_training(agent, 10, 5)) == 3
     assert deadline.measure("Pendulum-v1", 0.05, 20)["candidates"] > 0
-
-
-@pytest.mark.slow
-def test_learned_model(monkeypatch):
-    from benchmarks import learned_model
-
-    monkeypatch.setattr(learned_model, "EPISODES", 1)
-    arguments = "learned --env Pendulum-v1 --steps 620 --learning-starts 520 --max-error 2"
-    run(monkeypatch, learned_model, *arguments.split())
-    results = common.read("learned_model-Pendulum-v1-learned-0")
-    assert results["decisions searched"] == 99 and results["held-out error"] < 2
-    assert set(results["returns"]) == {"actor", "search, ensemble"}
-    errors = [row["observation error"] for row in results["error over horizon"]]
-    assert len(errors) == 5 and errors[0] < errors[-1]
