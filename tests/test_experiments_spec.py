@@ -145,6 +145,23 @@ def test_every_shipped_spec_is_tested_and_offered() -> None:
         read_spec("smok")
 
 
+@pytest.mark.parametrize(
+    ("algorithm", "params", "message"),
+    [
+        ("mcbs_td3", {"schedule_kwargs": {"final_search_share": 0.1}}, "final_search_share has no meaning"),
+        ("mcbs_td3", {"search_kwargs": {"rollout_nose": 0.1}}, "no 'rollout_nose'; known are rollout_noise"),
+        ("mcbs_td3", {"value_expansion": 2, "rollout_depth": 0}, "value_expansion needs a rollout_depth"),
+        ("td3", {"search_evaluation": {"rollout_depht": 3}}, "unknown settings: rollout_depht"),
+    ],
+)
+def test_settings_that_do_not_fit_together(
+    algorithm: str, params: dict[str, Any], message: str, tmp_path: Path
+) -> None:
+    arms = {"wrong": {"algorithm": algorithm, "params": params}}
+    with pytest.raises(SpecError, match=f"arm wrong, {algorithm}.yml: Pendulum-v1: .*{message}"):
+        expand(read_spec(spec_file(tmp_path, arms=arms)))
+
+
 def test_nothing_to_train(tmp_path: Path) -> None:
     (tmp_path / "none.yml").write_text(yaml.safe_dump({**SPEC, "arms": {}}))
     with pytest.raises(SpecError, match="there is nothing to train"):

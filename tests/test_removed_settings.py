@@ -16,7 +16,7 @@ from sb3_mcbs.checkpoints.settings import describe_agent
 from sb3_mcbs.checkpoints.settings import make_agent as make_agent_again
 from sb3_mcbs.search import PRESETS
 from sb3_mcbs.search.settings import STRATEGIES
-from sb3_mcbs.zoo.manager import _checked_search_evaluation
+from sb3_mcbs.zoo.manager import checked_search_evaluation
 from tests.conftest import SEARCHING, SMALL, snapshot_vec_env
 from tests.zoo_helpers import zoo_train
 
@@ -52,7 +52,7 @@ def test_an_old_name_is_refused_everywhere(make_agent, tmp_path, name):
         lambda: SearchPolicy(agent, env, **{name: 1}),
         lambda: setattr(agent, name, 1),
         lambda: setattr(SearchPolicy(agent, env), name, 1),
-        lambda: _checked_search_evaluation({name: 1}, "td3"),
+        lambda: checked_search_evaluation({name: 1}, "td3"),
     ):
         with pytest.raises(TypeError, match=words):
             use()

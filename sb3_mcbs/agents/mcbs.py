@@ -38,7 +38,7 @@ from sb3_mcbs.agents.planner import Planner
 from sb3_mcbs.agents.resumable import Resumable, Searching
 from sb3_mcbs.agents.roots import EnvironmentStep, Prediction
 from sb3_mcbs.agents.schedule import ScheduleSettings, SearchSchedule
-from sb3_mcbs.agents.value_expansion import Expanding
+from sb3_mcbs.agents.value_expansion import Expanding, ValueExpansionSettings
 from sb3_mcbs.networks.torch_settings import matmul_precision
 from sb3_mcbs.search import RecentActions, SearchResult, SearchSettings
 from sb3_mcbs.search.random_streams import spawn_rng
@@ -105,20 +105,28 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
         self.learned_model: LearnedModel | None = None
         self._noise_without_search: ActionNoise | None = None
 
-    def _checked_settings(self) -> tuple[SearchSettings, ScheduleSettings]:
+    def checked_settings(self) -> tuple[SearchSettings, ScheduleSettings]:
+        """
+        Check all settings of the search, each and together. This needs no environment.
+
+        :return: those of the search, and those of its schedule
+        :raises TypeError: if a value has the wrong type
+        :raises ValueError: if a value is out of range or does not fit the others
+        """
         settings, schedule = self.search_settings, self.schedule_settings
         schedule.check_search(settings)
         if not isinstance(self.action_noise_after_search, bool):
             raise TypeError(
                 f"action_noise_after_search must be True or False, got {self.action_noise_after_search!r}."
             )
+        ValueExpansionSettings.of(self).check_search(settings)
         return settings, schedule
 
     def _setup_model(self) -> None:
         # ``load`` sets attributes without calling the constructor, so settings are checked here.
         convert_older(self)
         vars(self).update(tidied({name: value for name, value in vars(self).items() if name in SETTINGS}))
-        settings, schedule = self._checked_settings()
+        settings, schedule = self.checked_settings()
         # ``load`` seeds once more; restored generators must keep their state.
         self._is_restored = self.search_rng is not None and self._seed_at_setup == self.seed
         super()._setup_model()
@@ -130,7 +138,7 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
             self._schedule = SearchSchedule(schedule, self.seed)
         self._schedule.settings = schedule
         self._remember_actions(settings)
-        self._set_up_expansion(settings)
+        self._set_up_expansion()
         set_up_learned_model(self)
         if self.env is not None:
             self._make_planner(self.env, settings)
@@ -141,9 +149,9 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
         return vars(self).get("_schedule") is not None
 
     def _follow_settings(self) -> None:
-        settings, schedule = self._checked_settings()
+        settings, schedule = self.checked_settings()
         check_learned_model(self)
-        self._follow_expansion(settings)
+        self._follow_expansion()
         if self.planner is not None and self.planner.follow(settings):
             self._check_states()
             self._say_what_simulates()

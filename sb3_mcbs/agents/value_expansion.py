@@ -354,27 +354,22 @@ class Expanding(CheckedRollouts):
     #: The states in which the next actions are executed.
     _states: np.ndarray | None = None
 
-    def _set_up_expansion(self, settings: SearchSettings) -> None:
-        self._check_expansion(settings)
+    def _set_up_expansion(self) -> None:
+        self._check_buffer()
         self._keeps_states = self.value_expansion > 0
 
-    def _follow_expansion(self, settings: SearchSettings) -> None:
-        """Refuse changed settings that need other arrays in the replay buffer.
-
-        :param settings: settings of the search.
-        """
-        self._check_expansion(settings)
+    def _follow_expansion(self) -> None:
+        """Refuse changed settings that need other arrays in the replay buffer."""
+        self._check_buffer()
         if (self.value_expansion > 0) != self._keeps_states:
             raise ValueError(
                 "value_expansion stores states in the replay buffer: it can be changed later, but not "
                 "from or to 0; save the agent, and load it with the other settings."
             )
 
-    def _check_expansion(self, settings: SearchSettings) -> None:
-        expansion = ValueExpansionSettings.of(self)
-        expansion.check_search(settings)
+    def _check_buffer(self) -> None:
         if self.replay_buffer is not None:  # it may have been taken away
-            expansion.check_buffer(self.replay_buffer.optimize_memory_usage)
+            ValueExpansionSettings.of(self).check_buffer(self.replay_buffer.optimize_memory_usage)
 
     def _check_states(self) -> None:
         """Refuse a forward model whose states cannot be kept."""

@@ -7,9 +7,10 @@ from typing import Any
 import gymnasium as gym
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from sb3_mcbs.agents.hyperparameters import SETTINGS
 from sb3_mcbs.agents.registry import SEARCHING
 from sb3_mcbs.experiments.document import Document, Place
-from sb3_mcbs.zoo.manager import NAMES, SEARCHABLE
+from sb3_mcbs.zoo.manager import NAMES, SEARCHABLE, checked_search_evaluation
 from sb3_mcbs.zoo.registration import register
 
 #: Hyperparameters that are RL Zoo's own, and no parameters of an algorithm's constructor.
@@ -95,6 +96,24 @@ def check_search(document: Document, place: Place, params: dict[str, Any], index
     for name, value in params.items():
         document.choice((*place, name, *index), name, known, "setting of a search:")
         check_params(document, place, "mcbs_td3", {name: value}, index)
+
+
+def check_together(algorithm: str, hyperparameters: dict[str, Any]) -> None:
+    """
+    Check settings of the search that are right each for itself.
+
+    :param algorithm: its name on RL Zoo's command line; ``search`` around a trained agent
+    :param hyperparameters: all of them
+    :raises TypeError: if a value has the wrong type
+    :raises ValueError: if a value is out of range or does not fit the others
+    """
+    if algorithm in SEARCHING:
+        settings = {name: value for name, value in hyperparameters.items() if name in {*SETTINGS, "preset"}}
+        SEARCHING[algorithm]("MlpPolicy", None, _init_setup_model=False, **settings).checked_settings()
+    elif algorithm == "search":
+        checked_search_evaluation(hyperparameters, "td3")
+    elif hyperparameters.get("search_evaluation") is not None:
+        checked_search_evaluation(hyperparameters["search_evaluation"], algorithm)
 
 
 def _check_type(document: Document, place: Place, parameter: inspect.Parameter, value: Any) -> None:

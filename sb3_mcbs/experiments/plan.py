@@ -7,6 +7,7 @@ from typing import Any
 
 import yaml
 
+from sb3_mcbs.experiments.algorithms import check_together
 from sb3_mcbs.experiments.spec import Agent, Arm, Evaluation, Spec, SpecError
 from sb3_mcbs.zoo.paths import PathError, hyperparams_path
 
@@ -98,6 +99,7 @@ def expand(spec: Spec) -> list[Run]:
 def _run(spec: Spec, arm: Arm, environment: str, seed: int, file: tuple[Path, dict[str, Any]]) -> Run:
     path, entries = file
     entry, hyperparameters = _entry_for(environment, path, entries)
+    _check(spec, arm, {**hyperparameters, **arm.params}, f", {path.name}: {entry}")
     return Run(
         name=f"{arm.name}_{environment.replace('/', '-')}_{seed}",
         arm=arm.name,
@@ -113,7 +115,15 @@ def _run(spec: Spec, arm: Arm, environment: str, seed: int, file: tuple[Path, di
     )
 
 
+def _check(spec: Spec, arm: Arm, hyperparameters: dict[str, Any], where: str = "") -> None:
+    try:
+        check_together(arm.algorithm, hyperparameters)
+    except (TypeError, ValueError) as error:
+        raise SpecError(f"{spec.name}: arm {arm.name}{where}: {error}") from error
+
+
 def _frozen_run(spec: Spec, arm: Arm, agent: Agent, seed: int) -> Run:
+    _check(spec, arm, arm.params)
     return Run(
         name=f"{arm.name}_{agent.name}_{seed}",
         arm=arm.name,

@@ -164,7 +164,7 @@ class MCBSExperimentManager(ExperimentManager):
     ) -> tuple[dict[str, Any], Any, list[Any], Any]:
         settings = hyperparams.pop("search_evaluation", None)
         if settings is not None:
-            self.search_evaluation = _checked_search_evaluation(settings, self.algo)
+            self.search_evaluation = checked_search_evaluation(settings, self.algo)
         return super()._preprocess_hyperparams(hyperparams)
 
     def objective(self, trial: optuna.Trial) -> float:
@@ -250,7 +250,16 @@ def _check_names(custom: dict[str, Any]) -> None:
             sys.exit(f"-params {name}:{value}: there is no such {name}; known are {', '.join(NAMES[name])}.")
 
 
-def _checked_search_evaluation(settings: Any, algo: str) -> dict[str, Any]:
+def checked_search_evaluation(settings: Any, algo: str) -> dict[str, Any]:
+    """
+    Check the settings of a search around an algorithm that does not search.
+
+    :param settings: ``search_evaluation`` of its hyperparameters
+    :param algo: the algorithm's name on RL Zoo's command line
+    :return: the settings, with those of their preset
+    :raises TypeError: if a value has the wrong type
+    :raises ValueError: if there is no such setting, or a value does not fit the others
+    """
     if algo not in SEARCHABLE:
         reason = (
             "is evaluated with its training's search settings already"
