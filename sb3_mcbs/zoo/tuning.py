@@ -1,6 +1,7 @@
 """What ``-optimize`` has beyond RL Zoo's: several seeds per trial, kept agents, and studies on a server."""
 
 import argparse
+import random
 import shutil
 import sys
 import time
@@ -21,11 +22,13 @@ from optuna.trial import FrozenTrial, TrialState
 RETURNS, SEEDS, OBJECTIVE, FOLDER = "returns", "seeds", "objective", "folder"
 #: Seconds between two signs of life of a worker. A trial without one for twice as long has lost its worker.
 HEARTBEAT = 60
-#: A trial whose workers die this often is not tried again: it may be what kills them.
+#: A trial that lost its worker is tried again this often: it may be what kills them.
 MAX_RETRIES = 3
 #: Seconds to wait for a gRPC proxy.
 PROXY_TIMEOUT = 20
 PROXY = "grpc://"
+#: Attempts, up to a second apart, to find a new database's tables complete.
+TABLE_ATTEMPTS = 20
 
 
 def interquartile_mean(returns: np.ndarray) -> float:
@@ -137,15 +140,16 @@ def _open_proxy(url: str) -> GrpcStorageProxy:
 
 
 def _open_database(url: str, heartbeat: int) -> RDBStorage:
-    from sqlalchemy.exc import ArgumentError, OperationalError
+    from sqlalchemy.exc import ArgumentError, DBAPIError
 
     options: dict[str, Any] = {}
     if heartbeat:
         retry = optuna.storages.RetryHeartbeatStaleTrialCallback(max_retry=MAX_RETRIES)
         options = dict(heartbeat_interval=heartbeat, heartbeat_stale_trial_callback=retry)
+    # A trial takes long: its connection may be closed by then.
+    options["engine_kwargs"] = {"pool_pre_ping": True}
     try:
-        # A trial takes long: its connection may be closed by then.
-        return RDBStorage(url, engine_kwargs={"pool_pre_ping": True}, **options)
+        return _with_tables(lambda: RDBStorage(url, **options))
     except ImportError as error:
         sys.exit(
             f"--storage needs a database driver that is not installed ({error.__cause__ or error}). For "
@@ -156,14 +160,28 @@ def _open_database(url: str, heartbeat: int) -> RDBStorage:
             f"--storage names no storage ({error}). Write FILE.log, "
             f"postgresql+psycopg://USER@HOST:PORT/DATABASE, sqlite:///FILE.db or {PROXY}HOST:PORT."
         )
-    except OperationalError as error:
+    except DBAPIError as error:
         reason = str(error.orig).splitlines()[0]
         sys.exit(f"--storage cannot be opened ({reason}). Start the server, or correct the URL.")
 
 
+def _with_tables(connect: Callable[[], RDBStorage]) -> RDBStorage:
+    """Connect again while another worker, started at the same time, creates the database's tables."""
+    from sqlalchemy.exc import DBAPIError, IntegrityError
+
+    for _ in range(TABLE_ATTEMPTS):
+        try:
+            return connect()
+        except DBAPIError as error:
+            if not isinstance(error, IntegrityError) and "already exists" not in str(error.orig):
+                raise
+            time.sleep(random.random())  # workers that failed together should not meet again
+    return connect()
+
+
 def join_study(storage: BaseStorage, name: str, settings: dict[str, Any]) -> None:
     """
-    Create a study or join it, and free its trials whose workers have died.
+    Create a study or join it, and let its trials whose workers have died be tried again.
 
     :param storage: an opened storage
     :param name: the study's name
@@ -180,6 +198,11 @@ def join_study(storage: BaseStorage, name: str, settings: dict[str, Any]) -> Non
                 f"The study {name} has --{option} {known}, not {value}: values of its trials could not be "
                 "compared. Use the same, or another --study-name."
             )
+    _free_lost_trials(study)
+
+
+def _free_lost_trials(study: optuna.Study) -> None:
+    """Let trials fail whose workers have died, and queue them again. Optuna does so before each trial."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
         optuna.storages.fail_stale_trials(study)
@@ -187,7 +210,9 @@ def join_study(storage: BaseStorage, name: str, settings: dict[str, Any]) -> Non
 
 class TotalTrialsCallback(MaxTrialsCallback):
     """
-    Ends a worker when the study has its trials, but not while the last ones might still lose their worker.
+    Ends a worker once the study has all its trials.
+
+    With heartbeats it waits for the last trials of others: one may lose its worker and be queued again.
 
     The parameters are those of Optuna's ``MaxTrialsCallback``.
     """
@@ -204,14 +229,10 @@ class TotalTrialsCallback(MaxTrialsCallback):
             if not running:
                 break
             if running != said:
-                print(
-                    f"Waiting for trials of other workers, should one be killed: {running}. Ctrl-C: do not."
-                )
+                print(f"Waiting for other workers' trials {running}, should one be killed.")
                 said = running
             time.sleep(heartbeat)
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-                optuna.storages.fail_stale_trials(study)
+            _free_lost_trials(study)
         super().__call__(study, trial)
 
 
