@@ -63,8 +63,8 @@ class SearchTrialEvalCallback(ActsWithSearch, TrialEvalCallback):
     ) -> None:
         attributes = trial.user_attrs
         #: The returns of each training, evaluation and episode.
-        self.returns: list[list[list[float]]] = [*attributes[RETURNS], []]
-        self.objective = OBJECTIVES[attributes[OBJECTIVE]]
+        self.returns: list[list[list[float]]] = [*attributes.get(RETURNS, []), []]
+        self.objective = OBJECTIVES[attributes.get(OBJECTIVE, "mean")]
         folder = best_model_save_path
         if folder is not None and SEEDS in attributes:
             folder = f"{folder}/seed_{len(self.returns) - 1}"

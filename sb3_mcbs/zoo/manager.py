@@ -245,6 +245,7 @@ class MCBSExperimentManager(ExperimentManager):
         """Train with one seed after another; Optuna draws a trial's parameters only once."""
         if SEEDS not in trial.user_attrs:  # a retried trial has those of the killed one
             drawn = np.random.SeedSequence([self.seed, trial.number]).generate_state(self.trial_seeds)
+            # Half of the range: SB3 adds the environment's index.
             trial.set_user_attr(SEEDS, [int(seed) // 2 for seed in drawn])
         value = -np.inf
         worker_seed = self.seed
