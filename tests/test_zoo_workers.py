@@ -26,7 +26,7 @@ from sb3_mcbs.zoo.manager import MCBSExperimentManager
 from tests.zoo_helpers import TINY, zoo_train
 
 DATABASE = "sqlite:///study.db"
-WORDS = ["-optimize", "-n", "200", "--n-evaluations", "1", "--eval-episodes", "1", "--no-optim-plots",
+WORDS = ["-optimize", "-n", "120", "--n-evaluations", "1", "--eval-episodes", "1", "--no-optim-plots",
          "--study-name", "tiny", "--num-threads", "1", "--sampler", "random", "--seed", "3"]  # fmt: skip
 
 
@@ -107,9 +107,9 @@ def test_agents_of_the_best_trials_are_kept(tune: Callable[..., optuna.Study], t
     assert [path.name for path in (tmp_path / "agents").iterdir()] == [folder.name]
     assert best.user_attrs["folder"] == str(folder)
     for seed in ("seed_0", "seed_1"):
-        assert TD3.load(folder / seed / "best_model.zip").num_timesteps == 200
+        assert TD3.load(folder / seed / "best_model.zip").num_timesteps == 120
         statistics = pickle.loads((folder / seed / "vecnormalize.pkl").read_bytes())
-        assert statistics.obs_rms.count > 200
+        assert statistics.obs_rms.count > 120
         assert (folder / seed / "evaluations.npz").exists()
 
 
@@ -290,44 +290,58 @@ def postgres_url() -> Iterator[str]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def start_worker(folder: Path, storage: str, seed: int, *words: str) -> subprocess.Popen:
-    command = [sys.executable, "-m", train.__name__, "--algo", "mcbs_td3", "--env", "Pendulum-v1", *WORDS]
-    options = ["--storage", storage, "--optimization-log-path", f"worker_{seed}", "--seed", str(seed), *words]
-    params = ["-params", *TINY, "model_kwargs:dict(n_threads=1)"]
-    return subprocess.Popen([*command, *options, *params], cwd=folder)
+@pytest.fixture
+def start_worker(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen]]:
+    """Start a process that tunes."""
+    workers: list[subprocess.Popen] = []
+
+    def start(storage: str, seed: int, *words: str) -> subprocess.Popen:
+        command = [sys.executable, "-m", train.__name__, "--algo", "mcbs_td3", "--env", "Pendulum-v1", *WORDS]
+        options = ["--storage", storage, "--optimization-log-path", f"worker_{seed}", "--seed", str(seed)]
+        params = ["-params", *TINY, "model_kwargs:dict(n_threads=1)"]
+        workers.append(subprocess.Popen([*command, *options, *words, *params], cwd=tmp_path))
+        return workers[-1]
+
+    yield start
+    for worker in workers:
+        worker.kill()
 
 
 @pytest.mark.slow
-def test_four_workers_one_killed(tmp_path: Path, postgres_url: str) -> None:
-    """The recipe of docs/tuning.md, with all workers started at once in a new database."""
-    options = ["--max-total-trials", "8", "--trial-seeds", "2", "--heartbeat", "3"]
-    workers = [start_worker(tmp_path, postgres_url, seed, *options) for seed in range(4)]
-    storage = optuna.storages.RDBStorage(
-        postgres_url, skip_table_creation=True, skip_compatibility_check=True
-    )
+def test_four_workers_one_killed(postgres_url: str, start_worker: Callable[..., subprocess.Popen]) -> None:
+    """The recipe of docs/tuning.md."""
+    options = ["-n", "200", "--max-total-trials", "8", "--trial-seeds", "2", "--heartbeat", "3"]
+    workers = [start_worker(postgres_url, seed, *options) for seed in range(4)]
+    storage = tuning.open_storage(postgres_url)
+    tuning.join_study(storage, "tiny", {})
+    study = optuna.load_study(study_name="tiny", storage=storage)
 
-    def trained_by(worker: int) -> list[optuna.trial.FrozenTrial]:
-        try:
-            trials = optuna.load_study(study_name="tiny", storage=storage).trials
-        except Exception:  # the tables are not there yet
-            return []
-        running = [trial for trial in trials if trial.state == TrialState.RUNNING]
-        return [t for t in running if f"worker_{worker}" in t.user_attrs.get("folder", "") and t.params]
+    def trained_by_the_first() -> list[optuna.trial.FrozenTrial]:
+        """Its trial with the first seed behind it."""
+        running = study.get_trials(states=(TrialState.RUNNING,))
+        return [
+            t for t in running if "worker_0" in t.user_attrs.get("folder", "") and t.user_attrs["returns"]
+        ]
 
-    while not (lost := trained_by(0)):
+    while not (lost := trained_by_the_first()):
         assert workers[0].poll() is None
         time.sleep(0.2)
     workers[0].kill()
     assert [worker.wait(500) for worker in workers[1:]] == [0, 0, 0]
 
-    trials = optuna.load_study(study_name="tiny", storage=storage).trials
+    trials = study.trials
     assert trials[lost[0].number].state == TrialState.FAIL
     (retried,) = [t for t in trials if t.system_attrs.get("retry_history") == [lost[0].number]]
     assert retried.params == lost[0].params and "worker_0" not in retried.user_attrs["folder"]
+    assert retried.user_attrs["seeds"] == lost[0].user_attrs["seeds"]
     finished = [trial for trial in trials if trial.state in (TrialState.COMPLETE, TrialState.PRUNED)]
     # Workers that end a trial in the same moment may begin one too many.
     assert 8 <= len(finished) <= 10 and len(finished) + 1 == len(trials)
 
+
+@pytest.mark.slow
+def test_workers_through_a_proxy(postgres_url: str, start_worker: Callable[..., subprocess.Popen]) -> None:
+    pytest.importorskip("grpc")
     port = free_port()
     serve = (
         "from optuna.storages import get_storage, run_grpc_proxy_server\n"
@@ -335,9 +349,8 @@ def test_four_workers_one_killed(tmp_path: Path, postgres_url: str) -> None:
     )
     proxy = subprocess.Popen([sys.executable, "-c", serve])
     try:
-        options = ["--study-name", "proxied", "--n-trials", "1"]
-        workers = [start_worker(tmp_path, f"grpc://127.0.0.1:{port}", seed, *options) for seed in (4, 5)]
+        workers = [start_worker(f"grpc://127.0.0.1:{port}", seed, "--n-trials", "1") for seed in (1, 2)]
         assert [worker.wait(300) for worker in workers] == [0, 0]
     finally:
         proxy.kill()
-    assert len(optuna.load_study(study_name="proxied", storage=storage).trials) == 2
+    assert len(optuna.load_study(study_name="tiny", storage=tuning.open_storage(postgres_url)).trials) == 2
