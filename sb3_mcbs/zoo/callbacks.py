@@ -3,13 +3,15 @@
 from typing import Any
 
 import numpy as np
-from rl_zoo3.callbacks import TrialEvalCallback
+import optuna
+from rl_zoo3.callbacks import SaveVecNormalizeCallback, TrialEvalCallback
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_mcbs.agents import MCBS, SearchPolicy
+from sb3_mcbs.zoo.tuning import OBJECTIVE, OBJECTIVES, RETURNS, SEEDS
 
 
 class ActsWithSearch(EvalCallback):
@@ -36,16 +38,66 @@ class SearchEvalCallback(ActsWithSearch):
 
 
 class SearchTrialEvalCallback(ActsWithSearch, TrialEvalCallback):
-    """Replaces the callback whose last evaluation is the objective of RL Zoo's ``-optimize``."""
+    """
+    Replaces the callback whose last evaluation is the objective of RL Zoo's ``-optimize``.
+
+    A trial may have several trainings, one after another, each with a callback of its own. The objective is
+    then that of the episodes of all trainings up to the present one. The first reports each evaluation to the
+    pruner; each further one reports its last only, as one more step. So a step means the same in all trials.
+
+    :param eval_env: a separate evaluation environment
+    :param trial: Optuna's trial; its user attributes say what the objective is, and what the trainings before
+        this one returned
+    :param best_model_save_path: the trial's folder, if any
+    :param log_path: not used: it is the same folder
+    :param eval_kwargs: the other arguments of RL Zoo's callback
+    """
+
+    def __init__(
+        self,
+        eval_env: Any,
+        trial: optuna.Trial,
+        best_model_save_path: str | None = None,
+        log_path: str | None = None,
+        **eval_kwargs: Any,
+    ) -> None:
+        attributes = trial.user_attrs
+        #: The returns of each training, evaluation and episode.
+        self.returns: list[list[list[float]]] = [*attributes.get(RETURNS, []), []]
+        self.objective = OBJECTIVES[attributes.get(OBJECTIVE, "mean")]
+        folder = best_model_save_path
+        if folder is not None and SEEDS in attributes:
+            folder = f"{folder}/seed_{len(self.returns) - 1}"
+        super().__init__(eval_env, trial, best_model_save_path=folder, log_path=folder, **eval_kwargs)
+        if folder is not None:
+            self.callback_on_new_best = SaveVecNormalizeCallback(save_freq=1, save_path=folder)
+            self.callback_on_new_best.parent = self
+
+    def _log_success_callback(self, locals_: dict[str, Any], globals_: dict[str, Any]) -> None:
+        super()._log_success_callback(locals_, globals_)
+        # This list grows with each episode. EvalCallback keeps it only if it writes a file.
+        self._episode_returns: list[float] = locals_["episode_rewards"]
 
     def _on_step(self) -> bool:
-        evaluations = self.eval_idx
-        continue_training = super()._on_step()
-        if self.eval_idx > evaluations and isinstance(self.model, SearchPolicy):
+        if self.eval_freq <= 0 or self.n_calls % self.eval_freq != 0:
+            return True
+        EvalCallback._on_step(self)  # not RL Zoo's, which reports the mean of this training
+        self.eval_idx += 1
+        self.returns[-1].append([float(value) for value in self._episode_returns])
+        self.trial.set_user_attr(RETURNS, self.returns)
+        if isinstance(self.model, SearchPolicy):
             self.trial.set_user_attr("search/decisions", int(self.model.n_decisions))
             self.trial.set_user_attr("search/simulated_steps", int(self.model.n_simulated_steps))
             self.trial.set_user_attr("search/invalid_rollouts", int(self.model.n_invalid_rollouts))
-        return continue_training
+        episodes = [training[self.eval_idx - 1] for training in self.returns]
+        self.last_mean_reward = self.objective(np.concatenate(episodes))
+        n_before = len(self.returns) - 1
+        n_evaluations = len(self.returns[0])
+        if n_before > 0 and self.eval_idx < n_evaluations:
+            return True
+        self.trial.report(self.last_mean_reward, self.eval_idx + n_before)
+        self.is_pruned = self.trial.should_prune()
+        return not self.is_pruned
 
 
 class SecondEvalCallback(EvalCallback):

@@ -1,18 +1,20 @@
 """RL Zoo's ExperimentManager, for agents that search."""
 
+import gc
 import inspect
 import sys
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium as gym
+import numpy as np
 import optuna
-from optuna.storages import JournalStorage
-from optuna.storages.journal import JournalFileBackend
 from rl_zoo3.exp_manager import ExperimentManager
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_mcbs.agents.hyperparameters import (
@@ -35,6 +37,17 @@ from sb3_mcbs.types import BACKENDS
 from sb3_mcbs.zoo.callbacks import SearchEvalCallback, SecondEvalCallback
 from sb3_mcbs.zoo.paths import PathError, hyperparams_path, sibling_folder
 from sb3_mcbs.zoo.sampler import HELD, with_limits
+from sb3_mcbs.zoo.tuning import (
+    FOLDER,
+    OBJECTIVE,
+    PROXY,
+    RETURNS,
+    SEEDS,
+    delete_agents,
+    join_study,
+    open_storage,
+    trial_folder,
+)
 
 #: ``-conf sb3_mcbs`` selects this package's file for the algorithm of the command line.
 PACKAGE_CONFIG = "sb3_mcbs"
@@ -95,6 +108,11 @@ class MCBSExperimentManager(ExperimentManager):
                 self.config = str(hyperparams_path(self.algo))
             except PathError as error:
                 sys.exit(f"-conf {config}: {error}")
+        self.trial_seeds = getattr(self.args, "trial_seeds", 1)
+        self.trial_objective = getattr(self.args, "trial_objective", "mean")
+        self.keep_trials = getattr(self.args, "keep_trials", None)
+        self.heartbeat = getattr(self.args, "heartbeat", 0)
+        self._study: optuna.Study | None = None
         if self.resumed_run is not None:
             self.save_path = str(self.resumed_run.folder)
             self.params_path = f"{self.save_path}/{self.env_name}"
@@ -149,13 +167,11 @@ class MCBSExperimentManager(ExperimentManager):
         :param convert: whether to convert the parameters to constructor arguments
         :return: the parameters
         """
-        params = super().load_trial(storage, study_name, trial_id, convert)
+        opened: Any = open_storage(storage)
+        params = super().load_trial(opened, study_name, trial_id, convert)
         if not convert or self.algo not in SEARCHING:
             return params
-        where: Any = storage
-        if storage.endswith(".log"):
-            where = JournalStorage(JournalFileBackend(storage))
-        study = optuna.load_study(storage=where, study_name=study_name)
+        study = optuna.load_study(storage=opened, study_name=study_name)
         trial = study.best_trial if trial_id is None else study.trials[trial_id]
         return with_limits(params, trial.user_attrs.get(HELD, {}))
 
@@ -167,9 +183,40 @@ class MCBSExperimentManager(ExperimentManager):
             self.search_evaluation = checked_search_evaluation(settings, self.algo)
         return super()._preprocess_hyperparams(hyperparams)
 
+    def hyperparameters_optimization(self) -> None:
+        """
+        Tune as RL Zoo does, in a storage that knows which workers live.
+
+        :raises SystemExit: for options that do not go together, or a storage that cannot be opened
+        """
+        if self.keep_trials is not None and self.optimization_log_path is None:
+            sys.exit("--keep-trials needs the folder to keep agents in: --optimization-log-path FOLDER.")
+        if self.trial_seeds > 1 and self.n_jobs != 1:
+            sys.exit("--trial-seeds needs --n-jobs 1. Start several workers with one --study-name instead.")
+        if self.storage is not None:
+            if self.storage.endswith(".log"):
+                Path(self.storage).parent.mkdir(parents=True, exist_ok=True)
+            if self.storage.startswith(PROXY) and self.heartbeat:
+                warnings.warn(
+                    "Optuna's gRPC proxy knows no heartbeats: a killed worker's trial stays unfinished.",
+                    stacklevel=2,
+                )
+            opened: Any = open_storage(self.storage, self.heartbeat)
+            self.storage = opened
+            if self.study_name is not None:
+                settings = {"trial-seeds": self.trial_seeds, "trial-objective": self.trial_objective}
+                join_study(opened, self.study_name, settings)
+        super().hyperparameters_optimization()
+        self._delete_agents()
+
+    def _delete_agents(self) -> None:
+        if self._study is not None and self.optimization_log_path and self.keep_trials is not None:
+            delete_agents(self._study, self.optimization_log_path, self.keep_trials)
+
     def objective(self, trial: optuna.Trial) -> float:
         """
-        Evaluate a trial as RL Zoo does, and prune it if the forward model cannot simulate it.
+        Evaluate a trial as RL Zoo does, with one or several seeds, and prune it if the forward model cannot
+        simulate it.
 
         The hyperparameter file's settings of the search are stored with the trial, so that the sampler avoids
         conflicts with them.
@@ -178,15 +225,39 @@ class MCBSExperimentManager(ExperimentManager):
         :return: the return to maximise
         :raises optuna.TrialPruned: for pruned trials
         """
+        self._study = trial.study
+        self._delete_agents()
         if self.algo in SEARCHING:
             names = {"optimize_memory_usage", *SETTINGS}
             held = {name: value for name, value in self._hyperparams.items() if name in names}
             trial.set_user_attr(HELD, held)
+        trial.set_user_attr(OBJECTIVE, self.trial_objective)
+        trial.set_user_attr(RETURNS, [])  # a retried trial has those of the killed one
+        if self.optimization_log_path is not None:
+            trial.set_user_attr(FOLDER, trial_folder(self.optimization_log_path, trial.number))
         try:
-            return super().objective(trial)
+            return super().objective(trial) if self.trial_seeds == 1 else self._train_seeds(trial)
         except ForwardModelError as reason:
             trial.set_user_attr("pruned", str(reason))
             raise optuna.TrialPruned(str(reason)) from reason
+
+    def _train_seeds(self, trial: optuna.Trial) -> float:
+        """Train with one seed after another; Optuna draws a trial's parameters only once."""
+        if SEEDS not in trial.user_attrs:  # a retried trial has those of the killed one
+            drawn = np.random.SeedSequence([self.seed, trial.number]).generate_state(self.trial_seeds)
+            # Half of the range: SB3 adds the environment's index.
+            trial.set_user_attr(SEEDS, [int(seed) // 2 for seed in drawn])
+        value = -np.inf
+        worker_seed = self.seed
+        try:
+            for seed in trial.user_attrs[SEEDS]:
+                self.seed = seed
+                set_random_seed(seed)
+                value = super().objective(trial)
+                gc.collect()  # agents and their buffers are in reference cycles
+        finally:
+            self.seed = worker_seed
+        return value
 
     def create_callbacks(self) -> None:
         """Create RL Zoo's callbacks, and the second evaluation before the run's own."""

@@ -10,7 +10,7 @@ import re
 import sys
 from collections.abc import Callable
 from functools import partial
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -20,6 +20,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_mcbs.agents.hyperparameters import MOVED, REMOVED, SETTINGS
 from sb3_mcbs.agents.registry import SEARCHING
 from sb3_mcbs.zoo.sampler import convert_mcbs_params, sample_mcbs_params
+from sb3_mcbs.zoo.tuning import TotalTrialsCallback, TrainParser
 
 #: Hyperparameters whose values may be names without quotes on the command line.
 NAMED = frozenset(
@@ -150,11 +151,16 @@ def _add_manager(exp_manager: Any) -> None:
     exp_manager.make_vec_env = make_vec_env
     exp_manager.EvalCallback = callbacks.SearchEvalCallback
     exp_manager.TrialEvalCallback = callbacks.SearchTrialEvalCallback
+    exp_manager.MaxTrialsCallback = TotalTrialsCallback
     # The commands import the class by name.
     for name in ("rl_zoo3.exp_manager", "rl_zoo3.train", "rl_zoo3.enjoy", "rl_zoo3.record_video"):
         module = sys.modules.get(name)
         if getattr(module, "ExperimentManager", None) is original:
             module.ExperimentManager = subclass  # type: ignore[union-attr]
+    for module in (sys.modules["__main__"], sys.modules.get("rl_zoo3.train")):
+        # Run with -m, the command is still importing: it makes its parser later.
+        if getattr(getattr(module, "__spec__", None), "name", None) == "rl_zoo3.train":
+            module.argparse = SimpleNamespace(ArgumentParser=TrainParser)  # type: ignore[union-attr]
 
 
 _PATCHES: dict[str, Callable[[Any], None]] = {

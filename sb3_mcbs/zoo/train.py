@@ -1,14 +1,15 @@
 """``python -m sb3_mcbs.zoo.train``: the command line of ``rl_zoo3.train``, also without the import hook."""
 
+import importlib
+
 from sb3_mcbs.zoo.registration import register
 
 
 def main() -> None:
     """Train as ``python -m rl_zoo3.train`` does, with this package registered."""
+    command = importlib.import_module("rl_zoo3.train")
     register()
-    from rl_zoo3.train import train
-
-    train()
+    command.train()
 
 
 if __name__ == "__main__":
