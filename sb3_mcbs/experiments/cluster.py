@@ -2,6 +2,9 @@
 
 import functools
 import json
+import os
+import socket
+import sys
 import time
 import uuid
 from collections.abc import Callable, Iterator
@@ -18,6 +21,8 @@ from sb3_mcbs.experiments.worker import Order, Report, describe
 GRACE = 120.0
 #: Seconds between two looks at a run.
 _LOOK_EVERY = 1.0
+#: Seconds that a cluster may take to answer.
+_PATIENCE = 10.0
 #: The exit status of a process that was killed.
 _KILLED = -9
 
@@ -48,12 +53,19 @@ def _make_seat() -> type:
     class Seat:
         """A place on a node for one run."""
 
-        def admit(self, expected: dict[str, str | None], token: Path | None) -> tuple[str, ...]:
+        def admit(
+            self, expected: dict[str, str | None], token: Path | None, added_paths: list[str]
+        ) -> tuple[str, ...]:
             """Say which node this is, and whether it may train."""
             import socket
+            import sys
 
             import ray
 
+            # What is checked here must be what the run's process will import.
+            for path in added_paths:
+                if path in sys.path:
+                    sys.path.remove(path)
             node = ray.get_runtime_context().get_node_id(), socket.gethostname()
             try:
                 from sb3_mcbs.experiments import worker
@@ -124,7 +136,7 @@ class RayRun:
 
     def _take_place(self) -> None:
         self._seat = self._cluster.new_seat()
-        self._answer = self._seat.admit.remote(describe(), self._cluster.token)
+        self._answer = self._seat.admit.remote(describe(), self._cluster.token, _added_paths())
         self._on_answer = self._on_admission
 
     def _ask(self, on_answer: Callable[[Any], None], method: str, *arguments: Any) -> None:
@@ -137,7 +149,7 @@ class RayRun:
             self._cluster.refuse(node)
             self._take_place()
             return
-        self.where = f" on {node.name} ({node.id[:8]})"
+        self.where = f", node {node.name} ({node.id[:8]})"
         order = self._cluster.order_for(self._folder)
         if order.scratch is None:
             self._folder.lock.give_back()  # to the worker, who holds it as long as its process may write
@@ -266,10 +278,11 @@ def connected(
     except ImportError as error:
         raise ResultsError("--engine ray needs Ray: pip install 'sb3-mcbs[ray]'.") from error
     try:
+        _reach(address)
         ray.init(address, log_to_driver=False, logging_level="ERROR")
-    except (ConnectionError, RuntimeError, ValueError) as error:
+    except (OSError, RuntimeError, ValueError) as error:
         raise ResultsError(
-            f"No Ray cluster answers at {address}: {_first_line(error)} Start one with 'ray start --head', "
+            f"No Ray cluster answers at {address}: {_first_line(error).rstrip('.')}. Start one with 'ray start --head', "
             "and on each other machine 'ray start --address=HEAD:6379'."
         ) from error
     token = None if scratch is not None else folder.absolute() / f".seen-by-nodes-{uuid.uuid4().hex}"
@@ -283,6 +296,21 @@ def connected(
         if token is not None:
             token.unlink(missing_ok=True)
         ray.shutdown()
+
+
+def _reach(address: str) -> None:
+    """See whether somebody listens at an address: Ray would try for many minutes."""
+    if address == "auto":
+        address = os.environ.get("RAY_ADDRESS", address)
+    host, colon, port = address.rpartition(":")
+    if colon and "/" not in host and port.isdecimal():
+        socket.create_connection((host, int(port)), timeout=_PATIENCE).close()
+
+
+def _added_paths() -> list[str]:
+    """What Ray puts before the other paths that its workers import from: folders of this process."""
+    script_folder = os.path.dirname(os.path.realpath(sys.argv[0]))
+    return [os.getcwd(), *([script_folder] if script_folder in sys.path else [])]
 
 
 @functools.cache

@@ -117,7 +117,9 @@ class Worker:
             self._packer = Packer(self._folder)
             self._packer.pack()  # the runner has what is there now
         self._run = self._folder.run()
-        self._process = Process(self._folder, command(self._folder), order.environment)
+        # Not from the folder where the cluster was started: the process imports what this worker does.
+        environment = {"PYTHONSAFEPATH": "1", **order.environment}
+        self._process = Process(self._folder, command(self._folder), environment)
         self._mark = self._what_counts()
         return Report()
 
