@@ -57,9 +57,6 @@ def _make_seat() -> type:
             self, expected: dict[str, str | None], token: Path | None, added_paths: list[str]
         ) -> tuple[str, ...]:
             """Say which node this is, and whether it may train."""
-            import socket
-            import sys
-
             import ray
 
             # What is checked here must be what the run's process will import.
@@ -282,8 +279,8 @@ def connected(
         ray.init(address, log_to_driver=False, logging_level="ERROR")
     except (OSError, RuntimeError, ValueError) as error:
         raise ResultsError(
-            f"No Ray cluster answers at {address}: {_first_line(error).rstrip('.')}. Start one with 'ray start --head', "
-            "and on each other machine 'ray start --address=HEAD:6379'."
+            f"No Ray cluster answers at {address}: {_first_line(error).rstrip('.')}. Start one with "
+            "'ray start --head', and on each other machine 'ray start --address=HEAD:6379'."
         ) from error
     token = None if scratch is not None else folder.absolute() / f".seen-by-nodes-{uuid.uuid4().hex}"
     try:
