@@ -7,11 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from rich.console import Console
 
 from sb3_mcbs.checkpoints.encoding import Encoded
 from sb3_mcbs.checkpoints.store import Store
 from sb3_mcbs.experiments import command, expand, read_spec, transfer
+from sb3_mcbs.experiments.cluster import Cluster
 from sb3_mcbs.experiments.display import Display
 from sb3_mcbs.experiments.engine import LOSSES, Engine
 from sb3_mcbs.experiments.process import Lost
@@ -156,6 +158,30 @@ def test_scratch_folders_of_killed_workers_are_removed(tmp_path: Path) -> None:
     killed.lock.give_back()
     new = _make_folder(order(folder, scratch))
     assert lives.path.is_dir() and new.path.is_dir() and not killed.path.exists()
+
+
+def test_a_trained_agent_goes_along(tmp_path: Path) -> None:
+    agent = tmp_path / "agent.zip"
+    agent.write_bytes(b"the agent")
+    spec = {
+        "agents": {"mine": {"file": str(agent), "environment": "Pendulum-v1"}},
+        "seeds": [0],
+        "evaluation": {"episodes": 2},
+        "arms": {"actor": {"policy": "actor"}},
+    }
+    (tmp_path / "spec.yml").write_text(yaml.safe_dump(spec))
+    parsed = read_spec(tmp_path / "spec.yml")
+    (folder,) = prepare(tmp_path / "results", parsed, expand(parsed))
+    made = _make_folder(Cluster(print, None, tmp_path / "scratch", 0).order_for(folder))
+    run = made.run()
+    assert run.agent is not None and Path(run.agent.file).read_bytes() == b"the agent"
+    assert Path(run.agent.file).is_relative_to(made.path) and run.agent.statistics is None
+    # Nothing of this comes back: the results name the file that the spec names.
+    packer = Packer(made)
+    packer.pack()
+    (made.path / "log.txt").write_text("played")
+    unpack(packer.pack(), folder)
+    assert folder.run().agent == parsed.agents[0] and folder.log_tail() == ["played"]
 
 
 def test_a_node_that_is_not_like_the_runners_is_refused(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ import json
 import os
 import socket
 import sys
+import textwrap
 import time
 import uuid
 from collections.abc import Callable, Iterator
@@ -316,4 +317,4 @@ def _seat_class() -> type:
 
 
 def _first_line(error: BaseException) -> str:
-    return next(iter(str(error).splitlines()), type(error).__name__)
+    return textwrap.shorten(next(iter(str(error).splitlines()), type(error).__name__), 200)
