@@ -16,8 +16,9 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_mcbs.experiments import command, expand, read_spec
 from sb3_mcbs.experiments.display import Display
+from sb3_mcbs.experiments.engine import ATTEMPTS, Engine
 from sb3_mcbs.experiments.evaluation import play
-from sb3_mcbs.experiments.local import ATTEMPTS, LocalEngine
+from sb3_mcbs.experiments.process import Process
 from sb3_mcbs.experiments.results import ResultsError, RunFolder, prepare
 from tests.experiment_helpers import (
     MCBS,
@@ -183,8 +184,10 @@ def test_a_run_ends_with_its_runner_from_its_first_moment_on(tmp_path: Path) -> 
     """Also while it imports, when nothing of this package is there yet to see to it."""
     code = (
         "import sys, time; from pathlib import Path; from sb3_mcbs.experiments.job import Job;"
+        "from sb3_mcbs.experiments.process import Process;"
         "from sb3_mcbs.experiments.results import RunFolder; folder = RunFolder(Path(sys.argv[1]));"
-        "folder.lock.take(); Job(folder).start(['sleep', '60']); print('started', flush=True); time.sleep(60)"
+        "folder.lock.take(); Job(folder).start(lambda folder: Process(folder, ['sleep', '60']));"
+        "print('started', flush=True); time.sleep(60)"
     )
     spec = read_spec(spec_file(tmp_path))
     folder = prepare(tmp_path / "results", spec, expand(spec))[0]
@@ -245,29 +248,26 @@ def test_two_runners_never_train_the_same_run(undisturbed: Path, tmp_path: Path)
     assert 0 in [runner.returncode for runner in runners] or all("to process" in text for text in texts)
 
 
-def engine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str) -> tuple[LocalEngine, Console]:
+def engine(tmp_path: Path, code: str, *words: str) -> tuple[Engine, Console]:
     """One run, in whose place a line of Python is executed."""
     spec = read_spec(spec_file(tmp_path, arms={"td3": SPEC["arms"]["td3"]}))
     folders = prepare(tmp_path / "results", spec, expand(spec))
-    monkeypatch.setattr("sb3_mcbs.experiments.local._GRACE", 0.5)
     console = Console(record=True, width=200, file=io.StringIO())
     script = (
         "import sys; from pathlib import Path; folder = Path(sys.argv[1]); status = folder / 'status.json'\n"
     )
 
-    def make_command(folder: RunFolder) -> list[str]:
-        return [sys.executable, "-c", script + code, str(folder.path)]
+    def launch(folder: RunFolder) -> Process:
+        return Process(folder, [sys.executable, "-c", script + code, str(folder.path), *words])
 
-    return LocalEngine(folders, 1, Display(console), make_command), console
+    return Engine(folders, 1, Display(console), launch, grace=0.5), console
 
 
 FINISH = 'status.write_text(\'{"state": "finished"}\')'
 
 
-def test_what_crashes_is_tried_again_and_then_given_up(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    crashing, console = engine(tmp_path, monkeypatch, "print('no memory'); sys.exit(7)")
+def test_what_crashes_is_tried_again_and_then_given_up(tmp_path: Path) -> None:
+    crashing, console = engine(tmp_path, "print('no memory'); sys.exit(7)")
     assert crashing.finish() == 1
     text = console.export_text()
     assert f"{TD3}: ended with status 7, trying again after attempt 1 of 3" in text
@@ -279,20 +279,18 @@ def test_what_crashes_is_tried_again_and_then_given_up(
 
     # The same command tries again, and this time it goes well.
     once = f"n = folder / 'n'; first = not n.exists(); n.touch(); {FINISH} if not first else sys.exit(1)"
-    mended, _ = engine(tmp_path, monkeypatch, once)
+    mended, _ = engine(tmp_path, once)
     assert mended.finish() == 0
     assert mended.jobs[0].folder.status["state"] == "finished"
 
 
-def test_a_process_that_ends_without_finishing_has_crashed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    ending, _ = engine(tmp_path, monkeypatch, "pass")
+def test_a_process_that_ends_without_finishing_has_crashed(tmp_path: Path) -> None:
+    ending, _ = engine(tmp_path, "pass")
     assert ending.finish() == 1 and ending.jobs[0].crashes == ATTEMPTS
 
 
-def test_what_another_runner_holds_is_left_to_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    ours, console = engine(tmp_path, monkeypatch, FINISH)
+def test_what_another_runner_holds_is_left_to_it(tmp_path: Path) -> None:
+    ours, console = engine(tmp_path, FINISH)
     other = RunFolder(ours.jobs[0].folder.path)
     assert other.lock.take() and not ours.jobs[0].folder.lock.take()
     assert ours.finish() == 1
@@ -301,18 +299,16 @@ def test_what_another_runner_holds_is_left_to_it(tmp_path: Path, monkeypatch: py
         in console.export_text()
     )
     other.lock.give_back()
-    free, _ = engine(tmp_path, monkeypatch, FINISH)
+    free, _ = engine(tmp_path, FINISH)
     assert free.finish() == 0
 
 
-def test_a_second_signal_kills(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_second_signal_kills(tmp_path: Path) -> None:
     stubborn = (
         "import os, signal, time; signal.signal(signal.SIGTERM, lambda *_: os.kill(int(sys.argv[2]), 2));"
         "os.kill(int(sys.argv[2]), 2); time.sleep(60)"
     )
-    runner, _ = engine(tmp_path, monkeypatch, stubborn)
-    make = runner.make_command
-    monkeypatch.setattr(runner, "make_command", lambda folder: [*make(folder), str(os.getpid())])
+    runner, _ = engine(tmp_path, stubborn, str(os.getpid()))
     assert runner.finish() == 130
     assert runner.jobs[0].exit_status == -signal.SIGKILL
     assert runner.jobs[0].folder.status["state"] == "interrupted"
@@ -321,7 +317,7 @@ def test_a_second_signal_kills(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 def test_the_table_of_a_terminal(tmp_path: Path, undisturbed: Path) -> None:
     spec = read_spec(undisturbed / "tiny.yml")
     folders = [folder_of(undisturbed / "results", run.name) for run in expand(spec)]
-    runner = LocalEngine(folders, 1, Display(Console(force_terminal=True, width=150, record=True)))
+    runner = Engine(folders, 1, Display(Console(force_terminal=True, width=150, record=True)))
     with runner.display.of(runner.jobs):
         runner.display.refresh()
     text = runner.display.console.export_text()

@@ -237,15 +237,24 @@ def circumstances(agent: OffPolicyAlgorithm) -> dict[str, Any]:
 
     :param agent: the agent.
     """
-    packages = ("numpy", "torch", "gymnasium", "stable-baselines3", "sb3-contrib", "mujoco", "sb3-mcbs")
     return {
         "device": str(agent.device),
         "torch threads": th.get_num_threads(),
         "float32 matrix products": th.get_float32_matmul_precision(),
-        "processor": f"{platform.machine()} {th.backends.cpu.get_cpu_capability()}",
-        "python": platform.python_version(),
-        **{package: _version(package) for package in packages},
+        "processor": processor(),
+        **versions(),
     }
+
+
+def processor() -> str:
+    """Return what this machine's processor can do, as far as PyTorch cares."""
+    return f"{platform.machine()} {th.backends.cpu.get_cpu_capability()}"
+
+
+def versions() -> dict[str, str | None]:
+    """Return the versions on which it depends what a run computes."""
+    packages = ("numpy", "torch", "gymnasium", "stable-baselines3", "sb3-contrib", "mujoco", "sb3-mcbs")
+    return {"python": platform.python_version(), **{package: _version(package) for package in packages}}
 
 
 @functools.cache

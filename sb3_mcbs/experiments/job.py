@@ -1,42 +1,11 @@
-"""A run while it is looked after: its process, its attempts, how fast it is."""
+"""A run while it is looked after: what trains it, its attempts, how fast it is."""
 
-import ctypes
-import os
-import signal
-import subprocess
-import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
+from sb3_mcbs.experiments.process import Lost, Trainer
 from sb3_mcbs.experiments.results import FINISHED, RunFolder
-
-#: Libraries that would otherwise take a thread per core for every run.
-_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
-#: Of prctl: the signal that a process gets when its parent ends.
-_PR_SET_PDEATHSIG = 1
-
-
-def command(folder: RunFolder) -> list[str]:
-    """
-    :param folder: of a run
-    :return: the command that trains it
-    """
-    return [sys.executable, "-m", "sb3_mcbs.experiments.train_run", str(folder.path)]
-
-
-def _ending_with(parent: int) -> Callable[[], None] | None:
-    """What a child process does first so that it ends with its parent, even if that is killed: on Linux."""
-    if not sys.platform.startswith("linux"):
-        return None
-    prctl = ctypes.CDLL(None).prctl
-
-    def end_with_parent() -> None:
-        prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-        if os.getppid() != parent:  # it has ended already
-            os._exit(1)
-
-    return end_with_parent
 
 
 class Job:
@@ -49,60 +18,68 @@ class Job:
     def __init__(self, folder: RunFolder) -> None:
         self.folder = folder
         self.run = folder.run()
-        #: waiting, running, finished, failed, interrupted, or taken by another runner.
+        #: waiting, queued, running, finished, failed, interrupted, or taken by another runner.
         self.state: str = folder.status["state"] if folder.status["state"] == FINISHED else "waiting"
         self.crashes = 0
+        #: Whether it was started from a checkpoint.
+        self.goes_on = False
+        #: How often in a row it was lost without a new checkpoint.
+        self.losses = 0
         self.exit_status: int | None = None
+        #: Why it has no exit status, if it was lost.
+        self.lost: Lost | None = None
         self.progress: dict[str, Any] = folder.progress
-        self._process: subprocess.Popen | None = None
+        self._trainer: Trainer | None = None
+        self._checkpoint_at_loss: int | None = None
         #: When it began and when it was last seen, and its steps then.
         self._times: list[tuple[float, int]] = []
 
-    def start(self, argv: Sequence[str]) -> None:
+    def start(self, launch: Callable[[RunFolder], Trainer]) -> None:
         """
-        Start its process, which holds the run's lock as this one does.
+        Have it trained. It is queued until its trainer has a place.
 
-        :param argv: the command that trains it
+        :param launch: from the run's folder, what trains it
         """
-        self.state = "running"
+        self.state = "queued"
+        self.goes_on = self.folder.newest_checkpoint(self.run) is not None
         self._times.clear()
         self.folder.progress_file.unlink(missing_ok=True)
         self.folder.status = {"state": "running", "started": time.time(), "crashes": self.crashes}
-        with self.folder.log.open("a") as log:
-            log.write(f"--- {time.strftime('%Y-%m-%d %H:%M:%S')}: {subprocess.list2cmdline(argv)}\n")
-            log.flush()
-            self._process = subprocess.Popen(
-                argv,
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                env={**os.environ, **_ONE_THREAD, "PYTHONUNBUFFERED": "1"},
-                pass_fds=[self.folder.lock.descriptor],
-                # Ctrl-C in a terminal reaches the runner alone, which passes it on.
-                start_new_session=True,
-                preexec_fn=_ending_with(os.getpid()),
-            )
+        self._trainer = launch(self.folder)
 
     def ask_to_stop(self) -> None:
         """Let the run write a checkpoint and end."""
-        if self._process is not None:
-            self._process.send_signal(signal.SIGTERM)
+        if self._trainer is not None:
+            self._trainer.ask_to_stop()
 
     def kill(self) -> None:
         """End the run and its worker processes at once."""
-        if self._process is not None:
-            os.killpg(self._process.pid, signal.SIGKILL)
+        if self._trainer is not None:
+            self._trainer.kill()
+
+    @property
+    def where(self) -> str | None:
+        """Where it is trained; None if it is not, or waits for a place."""
+        return None if self._trainer is None else self._trainer.where
 
     def has_ended(self) -> bool:
         """
-        :return: whether its process has ended; ``exit_status`` is known then
+        :return: whether its process has ended; ``exit_status`` is known then, or that it was ``lost``
         """
-        assert self._process is not None
-        self.exit_status = self._process.poll()
-        if self.exit_status is None:
+        assert self._trainer is not None
+        outcome = self._trainer.poll()
+        if outcome is None:
             return False
-        self._process = None
+        self._trainer = None
+        self.lost = outcome if isinstance(outcome, Lost) else None
+        self.exit_status = None if isinstance(outcome, Lost) else outcome
         return True
+
+    def note_loss(self) -> None:
+        """Count a loss; from the first one again if there has been a new checkpoint since the last."""
+        newest = self.folder.newest_checkpoint(self.run)
+        self.losses = self.losses + 1 if newest == self._checkpoint_at_loss else 1
+        self._checkpoint_at_loss = newest
 
     def end(self, state: str) -> None:
         """
@@ -111,7 +88,8 @@ class Job:
         :param state: what it is now
         """
         self.state = state
-        if state != FINISHED:  # the process itself has written that
+        # The process itself has written that it is finished. What was lost may be another runner's by now.
+        if state != FINISHED and self.folder.lock.is_held:
             self.folder.status = {
                 **self.folder.status, "state": state, "ended": time.time(), "crashes": self.crashes,
                 "exit_status": self.exit_status,

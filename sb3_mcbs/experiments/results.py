@@ -38,10 +38,19 @@ class Lock:
         self.path = path
         self._file: IO[str] | None = None
 
-    def take(self) -> bool:
+    def take(self, patience: float = 0) -> bool:
         """
+        :param patience: seconds to wait until it is free
         :return: whether it was free, and is ours now
         """
+        give_up = time.monotonic() + patience
+        while not self._try():
+            if time.monotonic() >= give_up:
+                return False
+            time.sleep(0.1)
+        return True
+
+    def _try(self) -> bool:
         file = self.path.open("a+")
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -59,6 +68,11 @@ class Lock:
         if self._file is not None:
             self._file.close()
             self._file = None
+
+    @property
+    def is_held(self) -> bool:
+        """Whether this object holds it."""
+        return self._file is not None
 
     @property
     def descriptor(self) -> int:
@@ -124,12 +138,19 @@ class RunFolder:
         own = self.training(run)
         return [own, sibling_folder(own, "actor"), sibling_folder(own, "search")]
 
-    def has_begun(self, run: Run) -> bool:
+    def checkpoints(self, run: Run) -> Store:
         """
         :param run: what is trained here
-        :return: whether there is an exact checkpoint to go on from
+        :return: its exact checkpoints
         """
-        return bool(Store(self.training(run) / CHECKPOINTS).steps())
+        return Store(self.training(run) / CHECKPOINTS)
+
+    def newest_checkpoint(self, run: Run) -> int | None:
+        """
+        :param run: what is trained here
+        :return: the step of the newest exact checkpoint; None if there is none to go on from
+        """
+        return max(self.checkpoints(run).steps(), default=None)
 
     @property
     def status(self) -> dict[str, Any]:
@@ -169,11 +190,8 @@ def prepare(folder: Path, spec: Spec, runs: list[Run]) -> list[RunFolder]:
     """
     folder.mkdir(parents=True, exist_ok=True)
     lock = Lock(folder / "lock")
-    give_up = time.monotonic() + _PATIENCE
-    while not lock.take():  # another runner does the same at this moment
-        if time.monotonic() > give_up:
-            raise ResultsError(f"{folder} has been locked for long by process {lock.holder()}. End that one.")
-        time.sleep(0.1)
+    if not lock.take(_PATIENCE):  # another runner does the same at this moment
+        raise ResultsError(f"{folder} has been locked for long by process {lock.holder()}. End that one.")
     try:
         by_name = {run.name: run for run in runs}
         for path in sorted((folder / "runs").glob("*/run.yml")):
@@ -193,13 +211,13 @@ def prepare(folder: Path, spec: Spec, runs: list[Run]) -> list[RunFolder]:
     return folders
 
 
-def write(path: Path, text: str) -> None:
+def write(path: Path, content: str | bytes) -> None:
     """
     :param path: a file, replaced in one go
-    :param text: its new content
+    :param content: its new content
     """
     partial = path.with_name(f".{path.name}.partial")
-    partial.write_text(text)
+    partial.write_bytes(content.encode() if isinstance(content, str) else content)
     partial.replace(path)
 
 

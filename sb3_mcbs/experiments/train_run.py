@@ -13,7 +13,6 @@ from sb3_mcbs.experiments.manager import RunManager
 from sb3_mcbs.experiments.plan import Run
 from sb3_mcbs.experiments.results import FINISHED, RunFolder
 from sb3_mcbs.zoo import train
-from sb3_mcbs.zoo.manager import CHECKPOINTS
 from sb3_mcbs.zoo.registration import register
 from sb3_mcbs.zoo.resume import resume
 
@@ -39,14 +38,14 @@ def train_run(path: Path) -> None:
         evaluate_agent(folder)
     # Whoever asks for the state of a run believes this line: it is written when all else is there.
     folder.status = {**folder.status, "state": FINISHED, "ended": time.time()}
-    shutil.rmtree(folder.training(run) / CHECKPOINTS, ignore_errors=True)
+    shutil.rmtree(folder.checkpoints(run).folder, ignore_errors=True)
 
 
 def _train(folder: RunFolder, run: Run) -> None:
     register()
     RunManager.run, RunManager.folder = run, folder
     rl_zoo3.train.ExperimentManager = RunManager  # type: ignore[misc]
-    if folder.has_begun(run):
+    if folder.newest_checkpoint(run) is not None:
         resume(folder.training(run))
     else:
         shutil.rmtree(folder.logs, ignore_errors=True)

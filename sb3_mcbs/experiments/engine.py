@@ -1,4 +1,4 @@
-"""The local engine: runs on this machine, several at a time, each in a process of its own."""
+"""The engine: finishes runs, several at a time, each in a process of its own, here or on other nodes."""
 
 import signal
 import time
@@ -7,38 +7,48 @@ from contextlib import contextmanager
 from types import FrameType
 
 from sb3_mcbs.experiments.display import Display
-from sb3_mcbs.experiments.job import Job, command
+from sb3_mcbs.experiments.job import Job
+from sb3_mcbs.experiments.process import Trainer, start_process
 from sb3_mcbs.experiments.results import FINISHED, RunFolder
 
 #: A run that crashes is started this often in all.
 ATTEMPTS = 3
-#: Seconds that the processes of a runner that was killed have to end.
-_GRACE = 5.0
+#: A run whose node is lost this often in a row, without a new checkpoint, is given up.
+LOSSES = 10
+#: Seconds that the processes of a runner that was killed, or of a lost node, have to end.
+GRACE = 5.0
 _TICK = 0.2
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
-class LocalEngine:
+#: States of a run that a trainer has.
+_STARTED = ("queued", "running")
+
+
+class Engine:
     """
     Finishes runs: skips what is finished, resumes what was cut off, tries again what crashed.
 
     :param folders: of the runs, in the order in which they are started
-    :param n_jobs: how many at a time
+    :param n_jobs: how many at a time; None: as many as get a place
     :param display: what shows how far they are
-    :param make_command: from a run's folder, the command that trains it
+    :param launch: from a run's folder, what trains it; by default a process of this machine
+    :param grace: seconds that the processes of a runner that was killed have to end
     """
 
     def __init__(
         self,
         folders: Sequence[RunFolder],
-        n_jobs: int,
+        n_jobs: int | None,
         display: Display,
-        make_command: Callable[[RunFolder], list[str]] = command,
+        launch: Callable[[RunFolder], Trainer] = start_process,
+        grace: float = GRACE,
     ) -> None:
         self.jobs = [Job(folder) for folder in folders]
         self.n_jobs = n_jobs
         self.display = display
-        self.make_command = make_command
+        self.launch = launch
+        self.grace = grace
         self._n_signals = 0
         self._n_heeded = 0
         self._idle_since: float | None = None
@@ -83,26 +93,33 @@ class LocalEngine:
         n_signals = self._n_signals  # read once: another one may come while this one is heeded
         if n_signals == self._n_heeded:
             return
-        running = self._of_state("running")
+        started = self._of_state(*_STARTED)
         if self._n_heeded == 0 and n_signals == 1:
+            n_running = len(self._of_state("running"))
             self.display.say(
-                f"Stopping: {len(running)} runs write a checkpoint after their present step. "
+                f"Stopping: {n_running} runs write a checkpoint after their present step. "
                 "Once more to stop them at once."
             )
-            for job in running:
+            for job in started:
                 job.ask_to_stop()
         else:
-            for job in running:
+            for job in started:
                 job.kill()
         self._n_heeded = n_signals
 
     def _look_after(self) -> None:
-        for job in self._of_state("running"):
+        for job in self._of_state(*_STARTED):
+            self._announce(job)
             has_ended = job.has_ended()
             if job.look():
                 self.display.evaluated(job)
             if has_ended:
                 self._note_end(job)
+
+    def _announce(self, job: Job) -> None:
+        if job.state == "queued" and job.where is not None:
+            job.state = "running"
+            self.display.say(f"{job.folder.name}: {'goes on' if job.goes_on else 'started'}{job.where}")
 
     def _note_end(self, job: Job) -> None:
         name = job.folder.name
@@ -112,6 +129,8 @@ class LocalEngine:
         elif self._n_signals:
             job.end("interrupted")
             self.display.say(f"{name}: stopped at {job.step} {job.run.unit}")
+        elif job.lost is not None:
+            self._note_loss(job, job.lost.reason)
         else:
             job.crashes += 1
             again = job.crashes < ATTEMPTS
@@ -123,9 +142,16 @@ class LocalEngine:
             )
             job.end("waiting" if again else "failed")
 
+    def _note_loss(self, job: Job, reason: str) -> None:
+        job.note_loss()
+        again = job.losses < LOSSES
+        outlook = "goes on elsewhere" if again else f"given up after {LOSSES} times without a new checkpoint"
+        self.display.say(f"{job.folder.name}: lost at {job.step} {job.run.unit}, {outlook}: {reason}")
+        job.end("waiting" if again else "failed")
+
     def _start_some(self) -> None:
         for job in self._of_state("waiting", "taken"):
-            if len(self._of_state("running")) >= self.n_jobs:
+            if self.n_jobs is not None and len(self._of_state(*_STARTED)) >= self.n_jobs:
                 return
             if not job.folder.lock.take():
                 if job.state != "taken":
@@ -134,12 +160,11 @@ class LocalEngine:
             if job.folder.status["state"] == FINISHED:
                 job.end(FINISHED)  # by another runner
                 continue
-            done = job.folder.has_begun(job.run)
-            job.start(self.make_command(job.folder))
-            self.display.say(f"{job.folder.name}: {'goes on' if done else 'started'}")
+            job.start(self.launch)
+            self._announce(job)
 
     def _is_done(self) -> bool:
-        if self._of_state("running"):
+        if self._of_state(*_STARTED):
             self._idle_since = None
             return False
         if self._n_signals:
@@ -148,4 +173,4 @@ class LocalEngine:
             return True
         # What is left is another runner's, or that of one that was killed a moment ago.
         self._idle_since = self._idle_since or time.monotonic()
-        return time.monotonic() - self._idle_since > _GRACE
+        return time.monotonic() - self._idle_since > self.grace
