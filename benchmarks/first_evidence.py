@@ -23,8 +23,8 @@ import numpy as np
 from stable_baselines3.common.monitor import load_results
 from stable_baselines3.common.save_util import load_from_zip_file
 
+from sb3_mcbs.zoo.evaluations import ACTOR, SEARCH, load_policies
 from sb3_mcbs.zoo.repeat import load_run
-from sb3_mcbs.zoo.report import ACTOR, SEARCH, load_policies
 
 SEARCH_SETTINGS = {
     "beam_width": 6,
@@ -130,8 +130,8 @@ def collect(runs: list[Run]) -> list[dict[str, Any]]:
     """
     rows = []
     for run in runs:
-        for policy, (timesteps, returns) in load_policies(run.folder).items():
-            for step, episodes in zip(timesteps, returns, strict=True):
+        for policy, evaluations in load_policies(run.folder).items():
+            for step, episodes in zip(evaluations.timesteps, evaluations.returns, strict=True):
                 rows.append(
                     {
                         "algo": run.algo,
