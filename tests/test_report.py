@@ -271,6 +271,33 @@ def test_logs_of_another_algorithm(tmp_path: Path) -> None:
     assert rows_of(episode_table(load_results(tmp_path / "logs")))["ppo_Hopper-v5_1"]["ended early"] == "50 %"
 
 
+def test_runs_of_one_algorithm_with_other_settings_are_other_arms(tmp_path: Path) -> None:
+    zoo(tmp_path, "mcbs_td3", runs=3)
+    for run, width in ((1, 6), (2, 18), (3, 18)):
+        place = tmp_path / "mcbs_td3" / f"Hopper-v5_{run}" / "Hopper-v5"
+        place.mkdir()
+        (place / "args.yml").write_text(f"{{env: Hopper-v5, seed: {run}}}")
+        (place / "config.yml").write_text(f"{{beam_width: {width}, n_timesteps: {run}.0, rollout_depth: 3}}")
+    results = load_results(tmp_path)
+    arms = [(run.arm, run.seed) for run in results.runs]
+    assert arms == [
+        ("mcbs_td3-beam_width=6", 1),
+        ("mcbs_td3-beam_width=18", 2),
+        ("mcbs_td3-beam_width=18", 3),
+    ]
+    assert rows_of(heat_pictures(results)[0].table)["18"]["D = 3"] == "250, 2 runs"
+
+
+def test_the_run_of_an_experiment_is_one_run(tmp_path: Path) -> None:
+    place = add_run(tmp_path, "mcbs_td3", CHEETAH, 0)
+    evaluate(place, [1.0, 2.0, 3.0], [2.0, 3.0, 4.0])
+    training = place.training(place.run())
+    (training / f"{CHEETAH}.zip").touch()
+    lines = report(place.path, tmp_path / "report")
+    assert lines[1] == "Mean return of the actor with search: 4.0 (2 episodes after 300 steps)"
+    assert lines[2:4] == [f"Model:          {training / CHEETAH}.zip", f"Logs:           {training}"]
+
+
 def test_the_baseline_can_be_chosen(tmp_path: Path) -> None:
     zoo(zoo(tmp_path, "a2c"), "ppo")
     assert load_results(tmp_path).competitors[0].arm == "a2c"

@@ -53,12 +53,12 @@ def report(folder: Path, output: Path, baseline: str | None = None) -> list[str]
     write_csv(output / "evaluations.csv", _evaluation_records(results))
     page = output / "report.html"
     page.write_text(render(results, parts, _commands(results, baseline)))
-    if len(results.runs) == 1:
-        return [*_single(results, folder, output), f"Report:         {page}"]
+    if len(results.runs) == 1 and not results.frozen:
+        return [*_single(results, output), f"Report:         {page}"]
     return [*summary(results), *results.problems, f"Report: {page}"]
 
 
-def _single(results: Results, folder: Path, output: Path) -> list[str]:
+def _single(results: Results, output: Path) -> list[str]:
     """What there is to say about one run."""
     run = results.runs[0]
     lines = [
@@ -66,9 +66,11 @@ def _single(results: Results, folder: Path, output: Path) -> list[str]:
         f"({each.returns.shape[1]} episodes after {each.timesteps[-1]} steps)"
         for name, each in run.policies.items()
     ]
-    models = sorted(folder.glob("*.zip"), key=lambda path: path.name.startswith(("best_model", "rl_model")))
+    models = sorted(
+        run.folder.glob("*.zip"), key=lambda path: path.name.startswith(("best_model", "rl_model"))
+    )
     lines.append(f"Model:          {models[0] if models else 'none, training did not end'}")
-    lines.append(f"Logs:           {folder}")
+    lines.append(f"Logs:           {run.folder}")
     lines += [f"Learning curve: {path}" for path in sorted(output.glob("curves-*-steps.png"))]
     return lines
 

@@ -1,6 +1,7 @@
 """What stands in the sections of a report: tables and pictures, and how numbers and names are written."""
 
 import html
+import re
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -127,4 +128,4 @@ def slug(text: str) -> str:
     :param text: any
     :return: the same as part of a file's name
     """
-    return "".join(sign if sign.isalnum() else "-" for sign in text)
+    return re.sub(r"\W+", "-", text)

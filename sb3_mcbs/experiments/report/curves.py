@@ -89,12 +89,25 @@ def curve_pictures(results: Results, task: str) -> list[Picture]:
         if (hours := _hours(each)) is not None
     ]
     pictures = []
-    for axis in (STEPS, SIMULATED, HOURS if times and max(times) >= 2 else MINUTES):
+    axes = [STEPS, HOURS if times and max(times) >= 2 else MINUTES]
+    if simulates(results, task):
+        axes.insert(1, SIMULATED)
+    for axis in axes:
         picture = _curves(results, task, axis, curves)
         if picture is not None:
             pictures.append(picture)
     beside = _beside_published(results, task, curves)
     return [*pictures, *([beside] if beside else [])]
+
+
+def simulates(results: Results, task: str) -> bool:
+    """
+    :param results: of a folder
+    :param task: environment
+    :return: whether some training simulated steps besides those of the environment
+    """
+    evaluations = [each for run in results.of(task) for each in run.policies.values()]
+    return any(each.simulated_steps is not None and each.simulated_steps[-1] > 0 for each in evaluations)
 
 
 def _curves(results: Results, task: str, axis: Axis, curves: Curves) -> Picture | None:

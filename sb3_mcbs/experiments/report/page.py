@@ -10,7 +10,7 @@ from markupsafe import Markup
 
 from sb3_mcbs.experiments.report.comparisons import final_picture, heat_pictures, overall_pictures
 from sb3_mcbs.experiments.report.content import Picture, Table, estimate_text, name_of, number
-from sb3_mcbs.experiments.report.curves import curve_pictures
+from sb3_mcbs.experiments.report.curves import curve_pictures, simulates
 from sb3_mcbs.experiments.report.drawing import COLOURS
 from sb3_mcbs.experiments.report.references import published_curves, sources
 from sb3_mcbs.experiments.report.runs import Results, short
@@ -141,6 +141,8 @@ def _facts(results: Results) -> list[tuple[str, str]]:
 
 
 def _about_returns(results: Results) -> list[str]:
+    if len(results.evaluated) == 1:
+        return ["The mean return over the episodes of the last evaluation."]
     text = [
         "The return of a run is the mean over the episodes of one evaluation. Each stroke is a run, the "
         "marker their interquartile mean, the bar its 95 % interval by stratified bootstrap over seeds. "
@@ -180,11 +182,19 @@ def _about_comparison(results: Results, by_what: str) -> list[str]:
 
 
 def _about_curves(results: Results) -> list[str]:
+    if len(results.evaluated) == 1:
+        return []
     text = [
         "Thick: the interquartile mean over seeds, at steps at which all runs of an arm were evaluated. "
         f"The band is its 95 % interval, from {MIN_SEEDS} seeds on. Thin: every seed. Over simulated steps "
         "and time, the thick line stands at the mean cost of its runs."
     ]
+    nowhere = [task for task in results.tasks if not simulates(results, task)]
+    if nowhere:
+        text.append(
+            f"In {', '.join(nowhere)} no training simulated steps besides those of the environment, or "
+            "nobody recorded them: there are no curves over simulated steps."
+        )
     if not any(each.policy == SEARCH for each in results.competitors):
         text.append("No run was evaluated with search.")
     return text

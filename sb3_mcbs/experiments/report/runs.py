@@ -1,7 +1,7 @@
 """The runs of a folder as far as they came: of an experiment, of RL Zoo, or a single one."""
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -47,6 +47,7 @@ class Result:
     :param environment: id
     :param seed: None: nobody recorded it
     :param state: finished, failed, unfinished or not started
+    :param folder: RL Zoo's folder of the run
     :param policies: evaluations by policy; empty: there are none yet
     :param settings: hyperparameters that were given for this arm
     :param machines: what it ran on, with the versions of packages
@@ -58,6 +59,7 @@ class Result:
     environment: str
     seed: int | None
     state: str
+    folder: Path
     policies: dict[str, Evaluations]
     settings: dict[str, Any] = field(default_factory=dict)
     machines: list[dict[str, Any]] = field(default_factory=list)
@@ -204,6 +206,7 @@ def _experiment_run(place: RunFolder, run: Run, problems: list[str]) -> Result:
         environment=run.environment,
         seed=run.seed,
         state=_STATES.get(state, state),
+        folder=folder,
         policies=policies,
         settings={"algorithm": run.algorithm, **run.params},
         machines=place.machines,
@@ -224,7 +227,22 @@ def _load_log_folder(folder: Path, run_folders: list[Path]) -> Results:
         except PathError as error:
             problems.append(_line(error))
         runs.append(_zoo_run(path, policies, problems))
-    return Results(folder.absolute().name, runs, problems)
+    return Results(folder.absolute().name, _tell_apart(runs), problems)
+
+
+def _tell_apart(runs: list[Result]) -> list[Result]:
+    """Runs of one algorithm with different settings are no seeds of one another, but different arms."""
+    told = []
+    for run in runs:
+        others = [each for each in runs if (each.arm, each.task) == (run.arm, run.task) and each.settings]
+        differing = [
+            name
+            for name in run.settings
+            if any(each.settings.get(name) != run.settings[name] for each in others)
+        ]
+        arm = "-".join([run.arm, *(f"{name}={run.settings[name]}" for name in differing)])
+        told.append(replace(run, arm=arm))
+    return sorted(told, key=lambda run: _natural(run.arm))
 
 
 def _zoo_run(path: Path, policies: dict[str, Evaluations], problems: list[str]) -> Result:
@@ -235,6 +253,7 @@ def _zoo_run(path: Path, policies: dict[str, Evaluations], problems: list[str]) 
     if list(path.glob("*/args.yml")):
         try:
             settings, args = load_run(path)
+            settings.pop("n_timesteps", None)  # how long it trains does not make it another arm
         except PathError as error:
             problems.append(_line(error))
     environment = str(args.get("env") or environment or path.name)
@@ -248,8 +267,9 @@ def _zoo_run(path: Path, policies: dict[str, Evaluations], problems: list[str]) 
         environment=environment,
         seed=args.get("seed"),
         state=FINISHED if finished else "unfinished",
+        folder=path,
         policies=policies,
-        settings={"algorithm": path.parent.name, **settings},
+        settings=settings,
     )
 
 
@@ -266,11 +286,15 @@ def _order_of_arms(spec: str | None) -> Any:
     def key(arm: str) -> tuple[int, list[Any]]:
         of_arm = [name for name in names if arm == name or arm.startswith(f"{name}-")]
         place = names.index(max(of_arm, key=len)) if of_arm else len(names)
-        return place, [
-            (0, float(part), "") if part.isdigit() else (1, 0.0, part) for part in re.split(r"(\d+)", arm)
-        ]
+        return place, _natural(arm)
 
     return key
+
+
+def _natural(name: str) -> list[Any]:
+    """A key for sorting in which numbers are numbers."""
+    parts = re.split(r"(\d+)", name)
+    return [(0, float(part), "") if part.isdigit() else (1, 0.0, part) for part in parts]
 
 
 def _line(error: Exception) -> str:
