@@ -4,6 +4,7 @@ import csv
 import html.parser
 import re
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from sb3_mcbs.experiments.report.command import report
 from sb3_mcbs.experiments.report.comparisons import final_picture, heat_pictures, overall_pictures
 from sb3_mcbs.experiments.report.content import Table, number
 from sb3_mcbs.experiments.report.curves import curve_pictures
-from sb3_mcbs.experiments.report.page import sections
+from sb3_mcbs.experiments.report.page import Section, sections
 from sb3_mcbs.experiments.report.references import paper_beam, paper_finals, published_curves
 from sb3_mcbs.experiments.report.runs import Competitor, load_results
 from sb3_mcbs.experiments.report.statistics import (
@@ -65,7 +66,7 @@ class Page(html.parser.HTMLParser):
 
 def check_page(path: Path) -> str:
     """The text of a page that is well-formed and complete in itself."""
-    text = path.read_text()
+    text = path.read_text(encoding="utf-8")
     page = Page(text)
     assert not page.open
     ids = [value for _, name, value in page.attributes if name == "id"]
@@ -82,18 +83,30 @@ def rows_of(table: Table) -> dict[str, dict[str, str]]:
     return {row[0]: dict(zip(table.head, row, strict=True)) for row in table.rows}
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _few_resamples() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(statistics, "_REPEATS", 200)
+        yield
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return experiment(tmp_path_factory.mktemp("experiment") / "two-arms")
 
 
-def test_arms_are_compared_where_all_runs_have_come(folder: Path) -> None:
+@pytest.fixture(scope="module")
+def parts(folder: Path) -> dict[str, Section]:
+    return {part.name: part for part in sections(load_results(folder))}
+
+
+def test_arms_are_compared_where_all_runs_have_come(folder: Path, parts: dict[str, Section]) -> None:
     results = load_results(folder)
     assert (results.tasks, results.competitors) == ([CHEETAH, WALKER], [TD3, MCBS, MCBS_SEARCH])
     assert (common_step(results, CHEETAH), common_step(results, WALKER)) == (300, 200)
     assert finals(results, CHEETAH, TD3) == [3000, 4000, 5000]
     assert finals(results, WALKER, MCBS_SEARCH) == [800, 900]
-    text = " ".join(sections(results)[0].text)
+    text = " ".join(parts["returns"].text)
     assert "In Walker2d-v5 runs are compared after 200 environment steps" in text
     assert "mcbs_td3_Walker2d-v5_1 came no further; others have 300" in text and CHEETAH not in text
 
@@ -127,9 +140,8 @@ def test_probability_of_improvement(folder: Path) -> None:
     assert same is not None and same.value == 0.5 and same.low is not None and same.low < 0.5
 
 
-def test_means_over_environments_are_relative_to_a_published_agent(folder: Path) -> None:
-    results = load_results(folder)
-    (part,) = (part for part in sections(results) if part.name == "comparison")
+def test_means_over_environments_are_relative_to_a_published_agent(parts: dict[str, Section]) -> None:
+    part = parts["comparison"]
     assert "divided by the return of RL Zoo's published TD3 agent after 1,000,000 steps" in " ".join(
         part.text
     )
@@ -245,9 +257,16 @@ def test_the_page_and_its_files(folder: Path, tmp_path: Path) -> None:
         "seconds": "3600.0", "mean_return": "1000.0", "return_0": "999.0", "length_0": "1000",
         "return_1": "1001.0", "length_1": "1000",
     }  # fmt: skip
-    again = tmp_path / "again"
-    report(folder, again)
-    assert (again / "report.html").read_text() == text
+
+
+def test_the_same_report_twice(folder: Path) -> None:
+    state = np.random.get_state()[1].tolist()
+    pictures = []
+    for _ in range(2):
+        statistics._single.cache_clear()
+        pictures.append(final_picture(load_results(folder), CHEETAH))
+    assert pictures[0] == pictures[1] and "(3,000 to 5,000)" in pictures[0].alt
+    assert np.random.get_state()[1].tolist() == state
 
 
 def test_names_are_escaped(tmp_path: Path) -> None:

@@ -56,7 +56,7 @@ def page(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
             arm = f"mcbs_td3-with-a-name-that-says-all-of-it-{number}-beam_width=6-rollout_depth=3"
             evaluate(add_run(folder, arm, "HalfCheetah-v5", 0), [1e3, 2e4, 3e5], [1e3, 2e4, 3e5])
     report(folder, folder / "report")
-    return (folder / "report" / "report.html").read_text()
+    return (folder / "report" / "report.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("width", [400, 1400])
@@ -66,7 +66,7 @@ def test_nothing_is_cut_off(
 ) -> None:
     assert BROWSER is not None
     path = tmp_path / "page.html"
-    path.write_text(page.replace("<details>", "<details open>").replace("</body>", PROBE))
+    path.write_text(page.replace("<details>", "<details open>").replace("</body>", PROBE), encoding="utf-8")
     words = [
         *(BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--dump-dom"),
         *(f"--window-size={width},900", f"--blink-settings=preferredColorScheme={scheme}", path.as_uri()),

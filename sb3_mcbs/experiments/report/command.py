@@ -48,11 +48,11 @@ def report(folder: Path, output: Path, baseline: str | None = None) -> list[str]
     for part in parts:
         for picture in part.pictures:
             (output / f"{picture.name}.png").write_bytes(picture.drawing.png)
-            (output / f"{picture.name}.svg").write_text(picture.drawing.svg)
+            (output / f"{picture.name}.svg").write_text(picture.drawing.svg, encoding="utf-8")
     write_csv(output / "runs.csv", _run_records(results))
     write_csv(output / "evaluations.csv", _evaluation_records(results))
     page = output / "report.html"
-    page.write_text(render(results, parts, _commands(results, baseline)))
+    page.write_text(render(results, parts, _commands(results, baseline)), encoding="utf-8")
     if len(results.runs) == 1 and not results.frozen:
         return [*_single(results, output), f"Report:         {page}"]
     return [*summary(results), *results.problems, f"Report: {page}"]
@@ -129,7 +129,7 @@ def write_csv(path: Path, records: list[dict[str, object]]) -> None:
     :param records: rows by name of column; what a row lacks stays empty
     """
     names = list(dict.fromkeys(name for record in records for name in record))
-    with path.open("w", newline="") as file:
+    with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, names)
         writer.writeheader()
         writer.writerows(records)

@@ -62,6 +62,8 @@ def number(value: float | None) -> str:
     """
     if value is None or not np.isfinite(value):
         return "–"
+    if abs(value) < 1 and value:
+        return f"{value:.3g}".replace("-", "−")
     digits = 0 if abs(value) >= 100 or float(value).is_integer() else 1 if abs(value) >= 10 else 2
     return f"{value:,.{digits}f}".replace("-", "−")
 

@@ -137,6 +137,7 @@ def _figure(height: float) -> Any:
 def _finish(figure: Any) -> Drawing:
     png, svg = io.BytesIO(), io.StringIO()
     figure.savefig(png, format="png", dpi=150)
+    figure.set_layout_engine("none")  # it stays as it is, and is not worked out again
     figure.patch.set_alpha(0)
     figure.savefig(svg, format="svg", metadata={"Date": None})
     return Drawing(svg.getvalue(), png.getvalue())

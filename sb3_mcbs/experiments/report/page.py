@@ -88,7 +88,7 @@ def render(results: Results, parts: list[Section], commands: list[str]) -> str:
     environment = jinja2.Environment(
         autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )
-    template = environment.from_string((Path(__file__).parent / "page.html").read_text())
+    template = environment.from_string((Path(__file__).parent / "page.html").read_text(encoding="utf-8"))
     used = {run.environment for run in results.evaluated}
     return template.render(
         results=results,
@@ -145,9 +145,9 @@ def _about_returns(results: Results) -> list[str]:
         return ["The mean return over the episodes of the last evaluation."]
     text = [
         "The return of a run is the mean over the episodes of one evaluation. Each stroke is a run, the "
-        "marker their interquartile mean, the bar its 95 % interval by stratified bootstrap over seeds. "
-        f"With fewer than {MIN_SEEDS} runs there is no interval. With three to five it is a rough one: a "
-        "bootstrap knows nothing beyond the runs that it has."
+        "marker their interquartile mean (of three or fewer, their mean), the bar its 95 % interval by "
+        f"stratified bootstrap over seeds. With fewer than {MIN_SEEDS} runs there is no interval; with "
+        "three to five it is a rough one: a bootstrap knows nothing beyond the runs that it has."
     ]
     for task in [] if results.frozen else results.tasks:
         runs, step = results.of(task), common_step(results, task)

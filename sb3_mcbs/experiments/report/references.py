@@ -24,7 +24,7 @@ class Published(NamedTuple):
 
 @functools.cache
 def _content() -> dict[str, Any]:
-    return dict(yaml.safe_load((Path(__file__).parent / "references.yml").read_text()))
+    return dict(yaml.safe_load((Path(__file__).parent / "references.yml").read_text(encoding="utf-8")))
 
 
 def _base(environment: str) -> str:
