@@ -37,7 +37,13 @@ def speed_table(results: Results) -> Table:
             target = _baseline_return(results, run, policy)
             reached = None if target is None else first_at(evaluations, target)
             rows.append(
-                [run.name, policy, *_cost(evaluations, first), number(target), *_cost(evaluations, reached)]
+                [
+                    short(run.name),
+                    policy,
+                    *_cost(evaluations, first),
+                    number(target),
+                    *_cost(evaluations, reached),
+                ]
             )
     cost = ("steps", "steps of the search", "hours")
     head = [
@@ -71,7 +77,7 @@ def episode_table(results: Results) -> Table:
                 share = falls(run, evaluations, index)
                 rows.append(
                     [
-                        run.name,
+                        short(run.name),
                         policy,
                         number(float(evaluations.timesteps[index])),
                         str(evaluations.returns.shape[1]),
@@ -103,7 +109,13 @@ def run_table(results: Results) -> Table:
     head += [ACTOR, SEARCH, "steps of the search", "hours"]
     rows = []
     for run in results.runs:
-        start = [run.name, short(run.arm), run.task, "–" if run.seed is None else str(run.seed), run.state]
+        start = [
+            short(run.name),
+            short(run.arm),
+            run.task,
+            "–" if run.seed is None else str(run.seed),
+            run.state,
+        ]
         if not run.policies:
             rows.append([*start, *["–"] * 5])
             continue
