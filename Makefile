@@ -19,14 +19,14 @@ $(BIN)/python:
 
 # The hook that RL Zoo needs is written at installation, so a change to it installs again.
 $(STAMP): $(BIN)/python pyproject.toml setup.cfg constraints.txt _sb3_mcbs_build.py _sb3_mcbs_hook.py
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e ".[dev,plots,box2d,tuning,ray]"
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e ".[dev,plots,box2d,tuning,ray,report]"
 	touch $@
 
 install: $(STAMP)
 
 train: $(STAMP)
 	$(BIN)/python -m rl_zoo3.train --algo mcbs_td3 --env HalfCheetah-v5 -n 20000 --eval-freq 5000 -P
-	$(BIN)/python -m sb3_mcbs.zoo.report --algo mcbs_td3 --env HalfCheetah-v5
+	$(BIN)/sb3-mcbs report --algo mcbs_td3 --env HalfCheetah-v5
 
 test: $(STAMP)
 	$(BIN)/python -m pytest -n auto $(PYTEST_ARGS)

@@ -8,7 +8,10 @@ COMMANDS = {
     "experiment": ("sb3_mcbs.experiments.command", "train all runs of a spec, or go on with them"),
     "resume": ("sb3_mcbs.zoo.resume", "continue a run from its exact checkpoints"),
     "repeat": ("sb3_mcbs.zoo.repeat", "repeat a run from its folder"),
-    "report": ("sb3_mcbs.zoo.report", "returns and learning curve of a run's two policies"),
+    "report": (
+        "sb3_mcbs.experiments.report.command",
+        "a page with curves and numbers of all runs of a folder",
+    ),
     "convert-statistics": ("sb3_mcbs.zoo.convert_statistics", "write a trusted vecnormalize.pkl as npz"),
 }
 

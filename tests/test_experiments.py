@@ -2,6 +2,7 @@
 
 import io
 import os
+import platform
 import signal
 import socket
 import subprocess
@@ -68,6 +69,8 @@ def test_a_run_folder_says_what_it_is(undisturbed: Path) -> None:
     assert folder.run() == expand(read_spec(undisturbed / "tiny.yml"))[1]
     assert (undisturbed / "results" / "spec.yml").read_text() == (undisturbed / "tiny.yml").read_text()
     assert folder.status["state"] == "finished" and folder.status["crashes"] == 0
+    assert [machine["python"] for machine in folder.machines] == [platform.python_version()]
+    assert folder.machines[0]["torch"].startswith("2.") and socket.gethostname() not in str(folder.machines)
     assert folder.progress["step"] == 400 and set(folder.progress["returns"]) == {"actor", "search"}
     assert "Actor with search after 400 steps" in folder.log.read_text()
     assert not (folder.training(folder.run()) / "checkpoints").exists()

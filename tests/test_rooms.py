@@ -38,7 +38,7 @@ def imported_rooms(path: Path) -> set[str]:
 
 @pytest.mark.parametrize("room", MAY_IMPORT)
 def test_rooms_import_only_those_below(room: str) -> None:
-    files = [*PACKAGE.glob(f"{room}/*.py"), *PACKAGE.glob(f"{room}.py")]
+    files = [*PACKAGE.glob(f"{room}/**/*.py"), *PACKAGE.glob(f"{room}.py")]
     wrong = {file.name: imported_rooms(file) - {room, *MAY_IMPORT[room]} for file in files}
     assert files and not {name: rooms for name, rooms in wrong.items() if rooms}
 

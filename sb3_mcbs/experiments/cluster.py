@@ -2,6 +2,7 @@
 
 import functools
 import json
+import logging
 import os
 import socket
 import sys
@@ -277,7 +278,7 @@ def connected(
         raise ResultsError("--engine ray needs Ray: pip install 'sb3-mcbs[ray]'.") from error
     try:
         _reach(address)
-        ray.init(address, log_to_driver=False, logging_level="ERROR")
+        ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
     except (OSError, RuntimeError, ValueError) as error:
         raise ResultsError(
             f"No Ray cluster answers at {address}: {_first_line(error).rstrip('.')}. Start one with "

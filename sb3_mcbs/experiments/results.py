@@ -105,6 +105,7 @@ class RunFolder:
         self.logs = self.path / "logs"
         self.lock = Lock(self.path / "lock")
         self._status = self.path / "status.json"
+        self._machines = self.path / "machines.json"
 
     def create(self, run: Run) -> None:
         """
@@ -165,6 +166,18 @@ class RunFolder:
     def progress(self) -> dict[str, Any]:
         """``step``, and ``returns`` of the policies once they were evaluated."""
         return _read_json(self.progress_file)
+
+    @property
+    def machines(self) -> list[dict[str, Any]]:
+        """What the run's processes ran on, one entry for every change."""
+        return list(_read_json(self._machines).get("machines", []))
+
+    def note_machine(self, description: dict[str, Any]) -> None:
+        """
+        :param description: what the present process runs on
+        """
+        if description not in self.machines[-1:]:
+            write(self._machines, json.dumps({"machines": [*self.machines, description]}, indent=1) + "\n")
 
     def log_tail(self, lines: int = 15) -> list[str]:
         """

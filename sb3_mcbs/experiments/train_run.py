@@ -9,6 +9,7 @@ from pathlib import Path
 import rl_zoo3.train
 
 from sb3_mcbs.experiments.frozen import evaluate_agent
+from sb3_mcbs.experiments.machine import describe_machine
 from sb3_mcbs.experiments.manager import RunManager
 from sb3_mcbs.experiments.plan import Run
 from sb3_mcbs.experiments.results import FINISHED, RunFolder
@@ -32,6 +33,7 @@ def train_run(path: Path) -> None:
     """
     folder = RunFolder(path)
     run = folder.run()
+    folder.note_machine(describe_machine())
     if run.agent is None:
         _train(folder, run)
     else:

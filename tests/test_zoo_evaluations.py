@@ -1,4 +1,4 @@
-"""The two lines and the picture after ``make train``, and the command that names them."""
+"""Evaluations of a run's two policies, what is printed after ``make train``, and the command's errors."""
 
 import os
 import sys
@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from sb3_mcbs import cli
-from sb3_mcbs.zoo.report import ACTOR, SEARCH, load_policies, newest_run, report
+from sb3_mcbs.experiments.report.command import report
+from sb3_mcbs.zoo.evaluations import ACTOR, SEARCH, load_policies, newest_run
 
 
 def write_evaluations(folder: Path, last: float) -> None:
@@ -41,13 +42,14 @@ def test_report_says_what_was_reached_and_where_it_lies(logs: Path) -> None:
     folder = logs / "mcbs_td3" / "HalfCheetah-v5_1"
     for name in ("best_model", "HalfCheetah-v5"):
         (folder / f"{name}.zip").touch()
-    lines = report(folder)
+    lines = report(folder, folder / "report")
     assert lines[0] == "Mean return of the actor alone: 20.0 (2 episodes after 200 steps)"
     assert lines[1] == "Mean return of the actor with search: 30.0 (2 episodes after 200 steps)"
     assert lines[2].endswith("HalfCheetah-v5.zip")
-    picture = folder / "learning_curve.png"
+    picture = folder / "report" / "curves-HalfCheetah-v5-steps.png"
     assert lines[4].endswith(str(picture))
     assert picture.read_bytes().startswith(b"\x89PNG")
+    assert lines[5] == f"Report:         {folder / 'report' / 'report.html'}"
 
 
 def test_newest_run_is_the_one_evaluated_last(logs: Path) -> None:
@@ -66,7 +68,8 @@ def test_newest_run_is_the_one_evaluated_last(logs: Path) -> None:
 
 def test_run_without_evaluations_is_named(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="--eval-freq"):
-        report(tmp_path)
+        report(tmp_path, tmp_path / "report")
+    assert not (tmp_path / "report").exists()
 
 
 def test_wrong_paths_are_one_line(

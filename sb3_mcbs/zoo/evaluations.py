@@ -1,0 +1,113 @@
+"""The evaluations of a run's two policies, as ``evaluations.npz`` has them."""
+
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sb3_mcbs.zoo.paths import PathError, sibling_folder
+
+ACTOR = "actor alone"
+SEARCH = "actor with search"
+#: What one array of ``evaluations.npz`` is called here, and how many dimensions it has.
+_ARRAYS = {
+    "timesteps": ("timesteps", 1),
+    "results": ("returns", 2),
+    "ep_lengths": ("lengths", 2),
+    "simulated_steps": ("simulated_steps", 1),
+    "seconds": ("seconds", 1),
+}
+
+
+@dataclass(frozen=True)
+class Evaluations:
+    """
+    The evaluations of one policy during one run.
+
+    :param timesteps: ``[n_evaluations]``
+    :param returns: ``[n_evaluations, n_episodes]``
+    :param lengths: ``[n_evaluations, n_episodes]``; None: not recorded
+    :param simulated_steps: that the search had taken in training, ``[n_evaluations]``; None: not recorded
+    :param seconds: that training had taken, ``[n_evaluations]``; None: not recorded
+    """
+
+    timesteps: np.ndarray
+    returns: np.ndarray
+    lengths: np.ndarray | None = None
+    simulated_steps: np.ndarray | None = None
+    seconds: np.ndarray | None = None
+
+    @property
+    def means(self) -> np.ndarray:
+        """Mean return of each evaluation."""
+        return self.returns.mean(axis=1)
+
+
+def load_evaluations(folder: str | Path) -> Evaluations:
+    """
+    Read the file of an ``EvalCallback``, or of an experiment.
+
+    :param folder: the folder that contains ``evaluations.npz``
+    :return: its content
+    :raises PathError: if there is no such folder, or no evaluation in it
+    """
+    path = Path(folder) / "evaluations.npz"
+    if not Path(folder).is_dir():
+        raise PathError(
+            f"There is no folder {folder}. Name that of a run, for example logs/mcbs_td3/HalfCheetah-v5_1."
+        )
+    if not path.is_file():
+        raise PathError(f"{path} does not exist: train with --eval-freq smaller than the run's steps.")
+    try:
+        with np.load(path) as data:
+            arrays = {name: np.asarray(data[key]) for key, (name, _) in _ARRAYS.items() if key in data}
+            _check(arrays)
+    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        raise PathError(f"{path} is not what an EvalCallback writes: {error}") from error
+    return Evaluations(**arrays)
+
+
+def _check(arrays: dict[str, np.ndarray]) -> None:
+    for key, (name, n_dimensions) in _ARRAYS.items():
+        if name not in arrays:
+            if key in ("timesteps", "results"):
+                raise KeyError(key)
+        elif arrays[name].ndim != n_dimensions or len(arrays[name]) != len(arrays["timesteps"]):
+            raise ValueError(f"{key} has the shape {arrays[name].shape}")
+    if not arrays["returns"].size:
+        raise ValueError("there is no evaluation in it")
+
+
+def load_policies(run_folder: str | Path) -> dict[str, Evaluations]:
+    """
+    Read the evaluations of a run's policies.
+
+    :param run_folder: ``LOGS/ALGO/ENV_NUMBER``
+    :return: evaluations of ``actor alone`` and of ``actor with search``, if available
+    """
+    own = load_evaluations(run_folder)
+    if (sibling_folder(run_folder, "actor") / "evaluations.npz").is_file():
+        return {ACTOR: load_evaluations(sibling_folder(run_folder, "actor")), SEARCH: own}
+    if (sibling_folder(run_folder, "search") / "evaluations.npz").is_file():
+        return {ACTOR: own, SEARCH: load_evaluations(sibling_folder(run_folder, "search"))}
+    return {ACTOR: own}
+
+
+def newest_run(log_folder: str | Path, algo: str, env_id: str) -> Path:
+    """
+    Find the most recently evaluated run.
+
+    :param log_folder: RL Zoo's log folder
+    :param algo: the algorithm's name on RL Zoo's command line
+    :param env_id: the environment
+    :return: the run's folder
+    :raises PathError: if there is none
+    """
+    runs = list((Path(log_folder) / algo).glob(f"{env_id}_[0-9]*/evaluations.npz"))
+    if not runs:
+        raise PathError(
+            f"No evaluated run of {algo} on {env_id} in {log_folder}. Train one first: "
+            f"python -m rl_zoo3.train --algo {algo} --env {env_id} --eval-freq 5000 -f {log_folder}"
+        )
+    return max(runs, key=lambda path: path.stat().st_mtime).parent
