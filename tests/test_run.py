@@ -22,7 +22,7 @@ from stable_baselines3.common.vec_env import (
     VecNormalize,
 )
 
-from sb3_mcbs import MCBSSAC, MCBSTD3, MCBSTQC, SnapshotEnvWrapper
+from sb3_mcbs import MCBSSAC, MCBSTD3, MCBSTQC, MCBSCrossQ, SnapshotEnvWrapper
 from sb3_mcbs.models import ForwardModelError
 from tests.conftest import (
     SEARCHING,
@@ -136,7 +136,7 @@ GSDE = dict(use_sde=True, use_sde_at_warmup=True, sde_sample_freq=4)
 
 
 @pytest.mark.parametrize(
-    "cls, settings", [*((cls, {}) for cls in SEARCHING), (MCBSSAC, GSDE), (MCBSTQC, GSDE)]
+    "cls, settings", [*((cls, {}) for cls in SEARCHING), (MCBSSAC, GSDE), (MCBSTQC, GSDE), (MCBSCrossQ, GSDE)]
 )
 def test_before_learning_starts_it_is_the_agent_without_search(make_agent, cls, settings):
     """The same random numbers are drawn in the same order as without search until the first one."""
@@ -148,7 +148,7 @@ def test_before_learning_starts_it_is_the_agent_without_search(make_agent, cls, 
     assert agents[1].n_decisions == 0
 
 
-@pytest.mark.parametrize("cls", [MCBSSAC, MCBSTQC])
+@pytest.mark.parametrize("cls", [MCBSSAC, MCBSTQC, MCBSCrossQ])
 @pytest.mark.parametrize("settings", [{}, GSDE])
 def test_search_is_around_the_mean_action(make_agent, cls, settings):
     """Neither the actor's distribution nor gSDE decides what is searched, however wide they are."""
@@ -178,7 +178,7 @@ class NotesRandomness(BaseCallback):
         return True
 
 
-@pytest.mark.parametrize("cls", [MCBSSAC, MCBSTQC])
+@pytest.mark.parametrize("cls", [MCBSSAC, MCBSTQC, MCBSCrossQ])
 def test_searching_leaves_gsdes_resampling_as_it_is(make_agent, cls):
     """The matrices are those of the agent without search, step by step, and so is all later randomness."""
     noted = []
