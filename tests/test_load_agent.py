@@ -172,6 +172,10 @@ def test_algorithm_can_be_named(saved):
         load(path, algo="ppo")
     with pytest.raises(AgentFileError, match=r"not of the algorithm 'sac'.*25 output"):
         load(saved(TQC)[1], algo="sac")
+    with pytest.raises(AgentFileError, match=r"not of the algorithm 'sac'.*no target networks"):
+        load(saved(CrossQ)[1], algo="sac")
+    with pytest.raises(AgentFileError, match=r"not of the algorithm 'mcbs_crossq'.* and target networks"):
+        load(saved(SAC)[1], algo="mcbs_crossq")
 
 
 def test_path_without_suffix(saved):

@@ -81,6 +81,8 @@ def _read_tensors(content: bytes) -> dict[str, th.Tensor]:
     for name, tensor in state.items():
         if not bool(th.isfinite(tensor).all()):
             raise AgentFileError(f"tensor {name!r} has values that are infinite or not a number.")
+        if name.endswith(".ra_var") and bool((tensor < 0).any()):
+            raise AgentFileError(f"tensor {name!r} has variances below 0.")
     return {name: tensor.detach() for name, tensor in state.items()}
 
 
