@@ -30,6 +30,7 @@ from sb3_mcbs import (
     resume,
 )
 from sb3_mcbs.checkpoints import CheckpointError
+from sb3_mcbs.checkpoints.settings import check_settings, describe_agent
 from tests.checkpoint_helpers import Crash, assert_resumed_is_exact, assert_same_runs, crash, learn
 from tests.conftest import SEARCHING
 
@@ -265,6 +266,19 @@ def test_settings_are_those_of_the_run(tmp_path):
     crash(maker(MCBSTD3, beam_noise=0.37, gamma=0.9), tmp_path, 150, 105)
     agent = resume(tmp_path / "checkpoints")
     assert (agent.beam_noise, agent.gamma, agent.beam_width) == (0.37, 0.9, 3)
+
+
+def test_the_order_of_keys_is_no_setting(tmp_path):
+    """RL Zoo saves a run's dictionaries sorted, and makes the agent that goes on from these."""
+    keys = dict(rollout_noise=0.2, include_policy_action=True)
+    saved, same, other = (
+        describe_agent(maker(MCBSTD3, search_kwargs=search_kwargs)(tmp_path))
+        for search_kwargs in (keys, dict(sorted(keys.items())), {**keys, "rollout_noise": 0.3})
+    )
+    assert saved.json["nodes"] != same.json["nodes"]
+    check_settings(saved, same)
+    with pytest.raises(CheckpointError, match=r"run of the checkpoint: search_kwargs\."):
+        check_settings(saved, other)
 
 
 @pytest.mark.parametrize("cls", SEARCHING)
