@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
-from sb3_contrib import TQC
 from stable_baselines3 import SAC, TD3
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -17,8 +16,9 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecNormalize
 
 from benchmarks.common import NETWORKS
-from sb3_mcbs import MCBSDDPG, MCBSSAC, MCBSTD3, MCBSTQC, SnapshotEnvWrapper
+from sb3_mcbs import MCBSDDPG, MCBSSAC, MCBSTD3, MCBSTQC, MCBSCrossQ, SnapshotEnvWrapper
 from sb3_mcbs.checkpoints import ExactCheckpointCallback, resume
+from sb3_mcbs.networks.functions import STOCHASTIC
 
 
 class Case(NamedTuple):
@@ -48,6 +48,7 @@ ALGORITHMS: dict[str, tuple[type[OffPolicyAlgorithm], dict[str, Any]]] = {
     "mcbs_ddpg": (MCBSDDPG, {"model_kwargs": {"n_threads": 1}}),
     "mcbs_sac": (MCBSSAC, {"model_kwargs": {"n_threads": 1}, "use_sde": True, "search_share": 0.5}),
     "mcbs_tqc": (MCBSTQC, {"model_kwargs": {"n_threads": 1}, "preset": "balanced"}),
+    "mcbs_crossq": (MCBSCrossQ, {"model_kwargs": {"n_threads": 1}, "search_share": 0.5}),
     "mcbs_td3 with schedules": (
         MCBSTD3,
         {
@@ -188,7 +189,7 @@ def ending(agent: OffPolicyAlgorithm, folder: Path) -> dict[str, np.ndarray]:
     for part in ("actor", "critic"):
         for index, state in getattr(agent, part).optimizer.state_dict()["state"].items():
             result |= {f"{part} optimizer {index} {name}": _digest(value) for name, value in state.items()}
-    if isinstance(agent, SAC | TQC) and agent.log_ent_coef is not None:
+    if isinstance(agent, STOCHASTIC) and agent.log_ent_coef is not None:
         result["logarithm of the entropy coefficient"] = _digest(agent.log_ent_coef.detach())
     if getattr(agent, "learned_model", None) is not None:
         ensemble = agent.learned_model.ensemble  # type: ignore[attr-defined]

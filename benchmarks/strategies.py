@@ -235,7 +235,7 @@ def run_arms(agent: OffPolicyAlgorithm, name: str, arms: list[str], arguments: a
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("agent", type=Path, nargs="?", help="zip of a TD3, DDPG, SAC or TQC agent")
+    parser.add_argument("agent", type=Path, nargs="?", help="zip of a TD3, DDPG, SAC, TQC or CrossQ agent")
     parser.add_argument("env", nargs="?", help="its environment, for example HalfCheetah-v4")
     parser.add_argument("--seeds", choices=SEEDS, default="choosing")
     parser.add_argument("--arms", choices=ARMS, nargs="+", metavar="ARM", help="only these, in this order")

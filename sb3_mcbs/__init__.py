@@ -2,7 +2,7 @@
 
 from importlib.metadata import PackageNotFoundError, version
 
-from sb3_mcbs.agents import MCBS, MCBSDDPG, MCBSSAC, MCBSTD3, MCBSTQC, SearchPolicy
+from sb3_mcbs.agents import MCBS, MCBSDDPG, MCBSSAC, MCBSTD3, MCBSTQC, MCBSCrossQ, SearchPolicy
 from sb3_mcbs.agents.faults import NonFiniteError
 from sb3_mcbs.checkpoints import CheckpointError, ExactCheckpointCallback, resume
 from sb3_mcbs.loading import AgentFileError, load_agent, load_statistics, save_statistics
@@ -26,6 +26,7 @@ __all__ = [
     "CEMSettings",
     "CheckpointError",
     "ExactCheckpointCallback",
+    "MCBSCrossQ",
     "NonFiniteError",
     "SearchPolicy",
     "SearchSettings",

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from sb3_contrib import TQC
+from sb3_contrib import TQC, CrossQ
 from stable_baselines3 import DDPG, SAC, TD3
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_mcbs import MCBS, MCBSDDPG, MCBSSAC, MCBSTD3, MCBSTQC, SnapshotEnvWrapper
+from sb3_mcbs import MCBS, MCBSDDPG, MCBSSAC, MCBSTD3, MCBSTQC, MCBSCrossQ, SnapshotEnvWrapper
 from sb3_mcbs.agents import learned_model
 from sb3_mcbs.models import ensemble
 from sb3_mcbs.snapshot import registry, verification
@@ -32,6 +32,7 @@ WITHOUT_SEARCH: dict[type[MCBS], type[OffPolicyAlgorithm]] = {
     MCBSDDPG: DDPG,
     MCBSSAC: SAC,
     MCBSTQC: TQC,
+    MCBSCrossQ: CrossQ,
 }
 SEARCHING = list(WITHOUT_SEARCH)
 

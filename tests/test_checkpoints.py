@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from sb3_contrib import TQC
+from sb3_contrib import TQC, CrossQ
 from stable_baselines3 import DDPG, SAC, TD3, HerReplayBuffer
 from stable_baselines3.common.callbacks import EvalCallback, EveryNTimesteps
 from stable_baselines3.common.env_util import make_vec_env
@@ -25,11 +25,14 @@ from sb3_mcbs import (
     MCBSTD3,
     MCBSTQC,
     ExactCheckpointCallback,
+    MCBSCrossQ,
     SnapshotEnvWrapper,
     resume,
 )
 from sb3_mcbs.checkpoints import CheckpointError
+from sb3_mcbs.checkpoints.settings import check_settings, describe_agent
 from tests.checkpoint_helpers import Crash, assert_resumed_is_exact, assert_same_runs, crash, learn
+from tests.conftest import SEARCHING
 
 SMALL = dict(learning_starts=20, batch_size=16, seed=0, device="cpu")
 SEARCH = dict(beam_width=3, rollout_depth=2, n_simulations=2, model_kwargs=dict(n_threads=1))
@@ -90,6 +93,12 @@ RUNS = {
     "MCBSSAC, gSDE": maker(MCBSSAC, use_sde=True, use_sde_at_warmup=True),
     "MCBSTQC": maker(MCBSTQC),
     "MCBSTQC, fixed entropy, MuJoCo": maker(MCBSTQC, "InvertedPendulum-v5", ent_coef=0.1),
+    "MCBSCrossQ, value expansion": maker(
+        MCBSCrossQ,
+        "InvertedPendulum-v5",
+        value_expansion=2,
+        policy_kwargs=dict(net_arch=[16, 16], renorm_warmup_steps=30),
+    ),
     "TD3, Ornstein-Uhlenbeck, two environments": maker(TD3, n_envs=2, action_noise=OU_NOISE),
     "TD3, whole episodes": maker(TD3, "InvertedPendulum-v5", train_freq=(1, "episode"), gradient_steps=-1),
     "DDPG, large buffer": maker(DDPG, buffer_size=1000),
@@ -97,6 +106,7 @@ RUNS = {
     "SAC, learned entropy": maker(SAC),
     "SAC, gSDE": maker(SAC, use_sde=True, sde_sample_freq=7),
     "TQC, fixed entropy": maker(TQC, ent_coef=0.1),
+    "CrossQ, gSDE, fixed entropy": maker(CrossQ, use_sde=True, ent_coef=0.1),
     "SAC, memory saved": maker(
         SAC, optimize_memory_usage=True, replay_buffer_kwargs=dict(handle_timeout_termination=False)
     ),
@@ -258,7 +268,20 @@ def test_settings_are_those_of_the_run(tmp_path):
     assert (agent.beam_noise, agent.gamma, agent.beam_width) == (0.37, 0.9, 3)
 
 
-@pytest.mark.parametrize("cls", [MCBSTD3, MCBSDDPG, MCBSSAC, MCBSTQC])
+def test_the_order_of_keys_is_no_setting(tmp_path):
+    """RL Zoo saves a run's dictionaries sorted, and makes the agent that goes on from these."""
+    keys = dict(rollout_noise=0.2, include_policy_action=True)
+    saved, same, other = (
+        describe_agent(maker(MCBSTD3, search_kwargs=search_kwargs)(tmp_path))
+        for search_kwargs in (keys, dict(sorted(keys.items())), {**keys, "rollout_noise": 0.3})
+    )
+    assert saved.json["nodes"] != same.json["nodes"]
+    check_settings(saved, same)
+    with pytest.raises(CheckpointError, match=r"run of the checkpoint: search_kwargs\."):
+        check_settings(saved, other)
+
+
+@pytest.mark.parametrize("cls", SEARCHING)
 def test_settings_that_override_a_preset_are_those_of_the_run(cls, tmp_path):
     make = maker(cls, preset="strong", beam_width=7, search_kwargs=dict(rollout_noise=0.2, n_elites=None))
     crash(make, tmp_path, 60, 45)

@@ -133,7 +133,10 @@ def test_learn_may_be_called_again_after_a_signal(tmp_path):
 
 @pytest.mark.parametrize(
     "algorithm",
-    ["mcbs_td3", *(pytest.param(f"mcbs_{base}", marks=pytest.mark.slow) for base in ("ddpg", "sac", "tqc"))],
+    [
+        "mcbs_td3",
+        *(pytest.param(f"mcbs_{base}", marks=pytest.mark.slow) for base in ("ddpg", "sac", "tqc", "crossq")),
+    ],
 )
 def test_killed_while_writing(tmp_path, algorithm):
     """The small version of ``make bench-kill``: one SIGKILL inside a checkpoint, against a whole run."""
@@ -147,7 +150,9 @@ def test_killed_while_writing(tmp_path, algorithm):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("algorithm", ["mcbs_td3", "mcbs_ddpg", "mcbs_sac", "mcbs_tqc", "td3", "sac"])
+@pytest.mark.parametrize(
+    "algorithm", ["mcbs_td3", "mcbs_ddpg", "mcbs_sac", "mcbs_tqc", "mcbs_crossq", "td3", "sac"]
+)
 def test_killed_and_stopped_again_and_again(algorithm, tmp_path):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     assert start(algorithm, WORKERS, whole, 3000, 100).wait(300) == 0

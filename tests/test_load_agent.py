@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from sb3_contrib import TQC
+from sb3_contrib import TQC, CrossQ
 from stable_baselines3 import DDPG, SAC, TD3
 from stable_baselines3.common.env_util import make_vec_env
 from torch import nn
@@ -20,7 +20,7 @@ from sb3_mcbs.loading import agent_file
 from tests import agent_files as files
 from tests.conftest import SEARCHING, SMALL_SEARCH, assert_same_parameters
 
-ALL = [TD3, DDPG, SAC, TQC, *SEARCHING]
+ALL = [TD3, DDPG, SAC, TQC, CrossQ, *SEARCHING]
 
 
 @pytest.fixture
@@ -48,7 +48,7 @@ def test_acts_as_with_sb3s_loader(saved, cls, activation):
     assert ("policy_kwargs: activation_fn" in loaded.not_taken_over) == (activation is None)
 
 
-@pytest.mark.parametrize("cls", [SAC, TQC])
+@pytest.mark.parametrize("cls", [SAC, TQC, CrossQ])
 @pytest.mark.parametrize("clip_mean", [None, 0.5, 0.0])
 def test_state_dependent_exploration(saved, cls, clip_mean):
     kwargs = {} if clip_mean is None else dict(clip_mean=clip_mean, use_expln=True)
@@ -72,11 +72,15 @@ def test_state_dependent_exploration(saved, cls, clip_mean):
         (TD3, dict(n_critics=1)),
         (TQC, dict(n_critics=5, n_quantiles=7)),
         (TQC, dict(n_quantiles=3, share_features_extractor=True)),
+        (CrossQ, dict(net_arch=[])),
+        (CrossQ, dict(n_critics=3, net_arch=[8, 6, 4])),
+        (CrossQ, dict(batch_norm=False)),
+        (CrossQ, dict(batch_norm_eps=0.5, batch_norm_momentum=0.1, renorm_warmup_steps=5)),
     ],
 )
 def test_architecture_is_told_from_tensors(saved, cls, settings):
     _, path = saved(cls, policy_kwargs={"net_arch": [8], **settings})
-    loaded = load(path, algo={TD3: "td3", SAC: "sac", TQC: "tqc"}[cls])
+    loaded = load(path, algo=cls.__name__.lower())
     assert type(loaded) is cls
     files.assert_same_agent(loaded, cls.load(path, device="cpu"))
 
@@ -168,6 +172,10 @@ def test_algorithm_can_be_named(saved):
         load(path, algo="ppo")
     with pytest.raises(AgentFileError, match=r"not of the algorithm 'sac'.*25 output"):
         load(saved(TQC)[1], algo="sac")
+    with pytest.raises(AgentFileError, match=r"not of the algorithm 'sac'.*no target networks"):
+        load(saved(CrossQ)[1], algo="sac")
+    with pytest.raises(AgentFileError, match=r"not of the algorithm 'mcbs_crossq'.* and target networks"):
+        load(saved(SAC)[1], algo="mcbs_crossq")
 
 
 def test_path_without_suffix(saved):
@@ -233,7 +241,7 @@ def test_other_policies_are_refused_by_name(saved, make_agent, make_dict_env, tm
         load(files.with_policy(path, tmp_path / "cnn.zip", state))
     with pytest.raises(ValueError, match="without a features extractor of their own"):
         load(path, policy_kwargs=dict(features_extractor_class=Wave))
-    with pytest.raises(AgentFileError, match="not those of a TD3, DDPG, SAC or TQC agent"):
+    with pytest.raises(AgentFileError, match="not those of a TD3, DDPG, SAC, TQC or CrossQ agent"):
         load(files.with_policy(path, tmp_path / "ppo.zip", {"mlp_extractor.0.weight": th.zeros(3, 3)}))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch as th
 from rl_zoo3.utils import get_saved_hyperparams
-from sb3_contrib import TQC
+from sb3_contrib import TQC, CrossQ
 from stable_baselines3 import SAC, TD3
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
@@ -299,6 +299,37 @@ def test_missing_tensor_and_no_dictionary(saved, tmp_path):
         load(files.with_policy(path, tmp_path / "strange.zip", state))
     with pytest.raises(AgentFileError, match="must hold tensors by name, not a list"):
         load(files.with_policy(path, tmp_path / "strange.zip", [th.zeros(1)]))
+
+
+FIRST = "critic.qf0.0"  # batch renormalization of CrossQ
+
+
+@pytest.mark.parametrize(
+    ("cls", "tensors", "words"),
+    [
+        (CrossQ, {f"{FIRST}.ra_var": -th.ones(4)}, "variances below 0"),
+        (CrossQ, {f"{FIRST}.ra_var": None}, r"'critic\.qf0\.0\.ra_var' is missing"),
+        (CrossQ, {f"{FIRST}.ra_mean": th.zeros(4, dtype=th.int64)}, "must be dense float32"),
+        (CrossQ, {f"{FIRST}.steps": th.zeros(2)}, r"steps' has the shape \(2,\)"),
+        (CrossQ, {"critic_target.qf0.1.weight": th.zeros(16, 4)}, "that SB3's MlpPolicy does not have"),
+        (SAC, {f"{FIRST}.ra_mean": th.zeros(4)}, "not those of a TD3"),
+        (TD3, {f"{FIRST}.ra_mean": th.zeros(4)}, "not those of a TD3"),
+    ],
+)
+def test_normalization_is_whole_and_of_crossq_only(saved, tmp_path, cls, tensors, words):
+    _, path = saved(cls)
+    state = {**files.tensors_of(path), **tensors}
+    state = {name: tensor for name, tensor in state.items() if tensor is not None}
+    with pytest.raises(AgentFileError, match=words):
+        load(files.with_policy(path, tmp_path / "strange.zip", state))
+
+
+@pytest.mark.parametrize("eps", [0, -1, True, 10**400, "0.001", None])
+def test_the_normalizations_constant_is_checked(saved, tmp_path, eps):
+    _, path = saved(CrossQ)
+    strange = files.with_data(path, tmp_path / "strange.zip", policy_kwargs={"batch_norm_eps": eps})
+    with pytest.raises(AgentFileError, match=r"strange\.zip: batch_norm_eps must be"):
+        load(strange)
 
 
 @pytest.mark.parametrize(

@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from sb3_contrib import TQC
+from sb3_contrib import TQC, CrossQ
+from sb3_contrib.common.torch_layers import BatchRenorm1d
 from stable_baselines3 import DDPG, SAC, TD3
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_mcbs import MCBSTD3
 from sb3_mcbs.networks.functions import policy_function, value_function
 from sb3_mcbs.networks.mlp import MLP
-from sb3_mcbs.networks.plain_networks import actor_mlp
+from sb3_mcbs.networks.plain_networks import actor_mlp, critic_mlps
 from sb3_mcbs.networks.torch_settings import matmul_precision, one_thread
 from tests.conftest import SMALL
 
@@ -25,6 +26,17 @@ def agent_of(cls, settings=MappingProxyType({}), **policy_kwargs):
         seed=0,
         **{**SMALL, "policy_kwargs": dict(net_arch=[16, 12]) | policy_kwargs, **settings},
     )
+
+
+def change_normalization(agent):
+    """Give batch renormalization parameters and statistics that it might have after a training."""
+    for layer in agent.policy.modules():
+        if isinstance(layer, BatchRenorm1d):
+            with th.no_grad():
+                for tensor in (layer.ra_mean, layer.bias):
+                    tensor.normal_()
+                for tensor in (layer.ra_var, layer.scale):
+                    tensor.uniform_(0.2, 3)
 
 
 def sb3_action(agent, observations):
@@ -47,6 +59,10 @@ HANDLERS = [
     (SAC, {}),
     (SAC, dict(use_sde=True)),
     (TQC, {}),
+    (CrossQ, {}),
+    (CrossQ, dict(batch_norm=False)),
+    (CrossQ, dict(activation_fn=th.nn.Tanh, batch_norm_eps=0.1)),
+    (CrossQ, dict(net_arch=[])),
 ]
 
 
@@ -54,6 +70,8 @@ HANDLERS = [
 @pytest.mark.parametrize("rows", [1, 7])
 def test_same_numbers_as_sb3(cls, policy_kwargs, rows):
     agent = agent_of(cls, **policy_kwargs)
+    change_normalization(agent)
+    agent.policy.set_training_mode(False)
     rng = np.random.default_rng(0)
     observations, actions = rng.standard_normal((rows, 17)), rng.uniform(-1, 1, (rows, 6)).astype(np.float32)
     found = policy_function(agent)(observations)
@@ -76,6 +94,32 @@ def test_present_parameters_and_networks_are_used():
     agent.policy.actor = other.actor
     found = policy_function(agent)(observations)
     np.testing.assert_allclose(found, sb3_action(other, observations), rtol=1e-5, atol=1e-6)
+
+
+def test_batch_renormalization_has_the_present_statistics():
+    agent = agent_of(CrossQ)
+    rng = np.random.default_rng(0)
+    observations, actions = rng.standard_normal((5, 17)), rng.uniform(-1, 1, (5, 6)).astype(np.float32)
+    before = policy_function(agent)(observations), value_function(agent)(observations, actions)
+    change_normalization(agent)
+    agent.policy.set_training_mode(True)  # as in ``train``, where single rows would be normalized to nothing
+    statistics = {name: value.clone() for name, value in agent.policy.state_dict().items()}
+    actor_mlp(agent.actor), critic_mlps(agent.critic)  # covered, not left to SB3
+    found = policy_function(agent)(observations), value_function(agent)(observations, actions)
+    agent.policy.set_training_mode(False)
+    np.testing.assert_allclose(found[0], sb3_action(agent, observations), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(found[1], sb3_value(agent, observations, actions), rtol=1e-5, atol=1e-6)
+    assert abs(found[0] - before[0]).max() > 0.01 and abs(found[1] - before[1]).max() > 0.01
+    assert all(th.equal(value, statistics[name]) for name, value in agent.policy.state_dict().items())
+
+
+def test_batch_renormalization_that_is_not_covered():
+    layer = BatchRenorm1d(2)
+    with pytest.raises(TypeError, match="trained on the statistics of batches"):
+        _ = MLP(layer).parameters
+    layer.register_buffer("more", th.zeros(2))
+    with pytest.raises(TypeError, match="other parameters or statistics"):
+        MLP(layer)
 
 
 def test_hooks_run():

@@ -5,13 +5,13 @@ from copy import deepcopy
 import numpy as np
 import pytest
 import torch as th
-from sb3_contrib import TQC
-from stable_baselines3 import SAC, TD3
+from stable_baselines3 import TD3
 from torch import nn
 from torch.nn.utils import prune
 
 from sb3_mcbs import MCBSDDPG, MCBSSAC, MCBSTD3, MCBSTQC, SearchPolicy
 from sb3_mcbs.agents.value_expansion import target_actor
+from sb3_mcbs.networks.functions import STOCHASTIC
 from tests.conftest import SEARCHING, WITHOUT_SEARCH, snapshot_vec_env
 
 
@@ -21,19 +21,27 @@ def scaled_action(agent, observations):
 
 def other_network(agent):
     th.manual_seed(1)
-    if isinstance(agent, SAC | TQC):
+    if isinstance(agent, STOCHASTIC):
         agent.actor.latent_pi = nn.Sequential(nn.Linear(3, 8), nn.Tanh(), nn.Linear(8, 16))
     else:
         agent.actor.mu = nn.Sequential(nn.Linear(3, 8), nn.Tanh(), nn.Linear(8, 1), nn.Tanh())
 
 
 def first_of(agent):
-    return agent.actor.latent_pi if isinstance(agent, SAC | TQC) else agent.actor.mu
+    return agent.actor.latent_pi if isinstance(agent, STOCHASTIC) else agent.actor.mu
+
+
+def replace_activation(network, layer):
+    network[next(index for index, each in enumerate(network) if isinstance(each, nn.ReLU))] = layer
+
+
+def linear_of(agent):
+    return next(layer for layer in first_of(agent) if isinstance(layer, nn.Linear))
 
 
 def searched_layer(layer):
     def change(agent):
-        first_of(agent)[1] = layer()
+        replace_activation(first_of(agent), layer())
 
     return change
 
@@ -50,7 +58,7 @@ def searched_actor(agent):
 
 
 def searched_hook(agent):
-    first_of(agent)[0].register_forward_hook(lambda module, inputs, output: -output)
+    linear_of(agent).register_forward_hook(lambda module, inputs, output: -output)
 
 
 def searched_method(agent):
@@ -59,11 +67,11 @@ def searched_method(agent):
 
 
 def searched_pruning(agent):
-    prune.l1_unstructured(first_of(agent)[0], "weight", amount=0.9)
+    prune.l1_unstructured(linear_of(agent), "weight", amount=0.9)
 
 
 def searched_storage(agent):
-    first_of(agent)[0].weight.data = -first_of(agent)[0].weight.data
+    linear_of(agent).weight.data = -linear_of(agent).weight.data
 
 
 SEARCHED = {
@@ -111,7 +119,7 @@ def other_critic(agent):
 
 
 def dropout_in_a_critic(agent):
-    agent.policy.critic.q_networks[0][1] = nn.Dropout(0.5)
+    replace_activation(agent.policy.critic.q_networks[0], nn.Dropout(0.5))
 
 
 def hook_of_a_critic(agent):

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import torch as th
 from sb3_contrib import TQC
-from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_mcbs import MCBSDDPG, MCBSSAC, MCBSTD3, MCBSTQC, BeamSettings
+from sb3_mcbs import MCBSDDPG, MCBSSAC, MCBSTD3, MCBSTQC, BeamSettings, MCBSCrossQ
 from sb3_mcbs.agents.planner import Planner
+from sb3_mcbs.networks.functions import STOCHASTIC
 from sb3_mcbs.search import Roots, beam_search, draw_noise
 from tests.conftest import SMALL
 from tests.reference_search import Reference
@@ -19,6 +19,7 @@ from tests.reference_search import Reference
 
 def reference_for(agent, env):
     """Algorithm 1 in a copy of the environment, with one network call at a time."""
+    agent.policy.set_training_mode(False)
     simulator = env.clone()
     root = env.snapshot()
 
@@ -27,7 +28,7 @@ def reference_for(agent, env):
 
     def policy(observation):
         with th.no_grad():
-            how = dict(deterministic=True) if isinstance(agent, SAC | TQC) else {}
+            how = dict(deterministic=True) if isinstance(agent, STOCHASTIC) else {}
             return agent.actor(tensor(observation), **how).numpy()[0]
 
     def critics(observation, action):
@@ -78,6 +79,8 @@ AGENTS = [
     (MCBSTQC, {}),
     (MCBSTQC, dict(policy_kwargs=dict(net_arch=[16, 16], n_critics=3, n_quantiles=7))),
     (MCBSTQC, dict(use_sde=True)),
+    (MCBSCrossQ, {}),
+    (MCBSCrossQ, dict(use_sde=True)),
 ]
 
 

@@ -22,7 +22,7 @@ from stable_baselines3.common.vec_env import (
     VecNormalize,
 )
 
-from sb3_mcbs import MCBSSAC, MCBSTD3, MCBSTQC, SnapshotEnvWrapper
+from sb3_mcbs import MCBSSAC, MCBSTD3, MCBSTQC, MCBSCrossQ, SnapshotEnvWrapper
 from sb3_mcbs.models import ForwardModelError
 from tests.conftest import (
     SEARCHING,
@@ -60,7 +60,7 @@ def test_trains(make_agent, cls, env_id, depth):
         assert not np.array_equal(before[name], after[name]), name
 
 
-@pytest.mark.parametrize("cls", SEARCHING)
+@pytest.mark.parametrize("cls", [cls for cls in SEARCHING if "MultiInputPolicy" in cls.policy_aliases])
 def test_dict_observations(make_agent, make_dict_env, cls):
     agent = make_agent(make_dict_env(), policy="MultiInputPolicy", cls=cls)
     agent.learn(40)
@@ -136,7 +136,7 @@ GSDE = dict(use_sde=True, use_sde_at_warmup=True, sde_sample_freq=4)
 
 
 @pytest.mark.parametrize(
-    "cls, settings", [*((cls, {}) for cls in SEARCHING), (MCBSSAC, GSDE), (MCBSTQC, GSDE)]
+    "cls, settings", [*((cls, {}) for cls in SEARCHING), (MCBSSAC, GSDE), (MCBSTQC, GSDE), (MCBSCrossQ, GSDE)]
 )
 def test_before_learning_starts_it_is_the_agent_without_search(make_agent, cls, settings):
     """The same random numbers are drawn in the same order as without search until the first one."""
@@ -148,13 +148,13 @@ def test_before_learning_starts_it_is_the_agent_without_search(make_agent, cls, 
     assert agents[1].n_decisions == 0
 
 
-@pytest.mark.parametrize("cls", [MCBSSAC, MCBSTQC])
+@pytest.mark.parametrize("cls", [MCBSSAC, MCBSTQC, MCBSCrossQ])
 @pytest.mark.parametrize("settings", [{}, GSDE])
 def test_search_is_around_the_mean_action(make_agent, cls, settings):
     """Neither the actor's distribution nor gSDE decides what is searched, however wide they are."""
     policy_kwargs = dict(net_arch=[16], log_std_init=1.0) if settings else dict(net_arch=[16])
     agent = make_agent(
-        cls=cls, beam_width=1, beam_noise=0, policy_kwargs=policy_kwargs, learning_rate=0.0, **settings
+        cls=cls, beam_width=1, beam_noise=0, policy_kwargs=policy_kwargs, gradient_steps=0, **settings
     )
     agent.learn(40)
     observations = agent.replay_buffer.observations[20:40, 0]
@@ -178,7 +178,7 @@ class NotesRandomness(BaseCallback):
         return True
 
 
-@pytest.mark.parametrize("cls", [MCBSSAC, MCBSTQC])
+@pytest.mark.parametrize("cls", [MCBSSAC, MCBSTQC, MCBSCrossQ])
 def test_searching_leaves_gsdes_resampling_as_it_is(make_agent, cls):
     """The matrices are those of the agent without search, step by step, and so is all later randomness."""
     noted = []

@@ -8,7 +8,7 @@ from stable_baselines3 import TD3
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 
-from sb3_mcbs import MCBSSAC, MCBSTD3, MCBSTQC
+from sb3_mcbs import MCBSSAC, MCBSTD3, MCBSTQC, MCBSCrossQ
 from sb3_mcbs.agents.schedule import ScheduleSettings, SearchSchedule
 from sb3_mcbs.search import BeamSettings, draw_noise
 from sb3_mcbs.search.random_streams import spawn_rng
@@ -225,7 +225,7 @@ def test_settings_without_a_meaning_are_refused(make_agent, settings, search, wo
 
 
 @pytest.mark.parametrize(
-    "cls, settings", [*((cls, {}) for cls in SEARCHING), (MCBSSAC, GSDE), (MCBSTQC, GSDE)]
+    "cls, settings", [*((cls, {}) for cls in SEARCHING), (MCBSSAC, GSDE), (MCBSTQC, GSDE), (MCBSCrossQ, GSDE)]
 )
 def test_without_searched_steps_an_agent_is_the_one_without_search(make_agent, cls, settings):
     noise = OrnsteinUhlenbeckActionNoise(np.zeros(1), 0.3 * np.ones(1))

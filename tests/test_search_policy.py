@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.wrappers import RescaleAction, TransformObservation
-from sb3_contrib import TQC
+from sb3_contrib import TQC, CrossQ
 from stable_baselines3 import DDPG, PPO, SAC, TD3
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -24,7 +24,7 @@ from sb3_mcbs.models.copies import _COPIES
 from tests.conftest import SEARCHING, SMALL_SEARCH, snapshot_vec_env
 
 
-@pytest.mark.parametrize("cls", [TD3, DDPG, SAC, TQC, *SEARCHING])
+@pytest.mark.parametrize("cls", [TD3, DDPG, SAC, TQC, CrossQ, *SEARCHING])
 def test_every_agent(make_agent, cls):
     agent = make_agent(cls=cls).learn(40)
     env = make_vec_env("Pendulum-v1", 1, seed=1)
@@ -34,7 +34,7 @@ def test_every_agent(make_agent, cls):
     assert policy.last_result.simulated_steps == 3 + 6
 
 
-@pytest.mark.parametrize("cls", [TD3, SAC, TQC])
+@pytest.mark.parametrize("cls", [TD3, SAC, TQC, CrossQ])
 def test_critics_and_actor_are_the_agents(make_agent, cls):
     """Depth 0 ranks by the critic: compare with the networks asked directly."""
     import torch as th
@@ -107,7 +107,7 @@ def test_settings_default_to_the_agents(make_agent):
         SearchPolicy(agent, env, beam_with=3)
 
 
-@pytest.mark.parametrize("cls", [TD3, DDPG, SAC, TQC, *SEARCHING])
+@pytest.mark.parametrize("cls", [TD3, DDPG, SAC, TQC, CrossQ, *SEARCHING])
 def test_a_preset_takes_the_place_of_the_agents_settings(make_agent, cls):
     env, agent = make_vec_env("Pendulum-v1", 1), make_agent(cls=cls)
     policy = SearchPolicy(agent, env, preset="balanced", beam_width=5)

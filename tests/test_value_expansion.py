@@ -3,18 +3,19 @@
 import numpy as np
 import pytest
 import torch as th
+from sb3_contrib.common.torch_layers import BatchRenorm1d
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 
-from sb3_mcbs import MCBSDDPG, MCBSSAC, MCBSTD3, MCBSTQC
+from sb3_mcbs import MCBSDDPG, MCBSSAC, MCBSTD3, MCBSTQC, MCBSCrossQ, SearchPolicy
 from sb3_mcbs.agents.value_expansion import ExpandedReplayBuffer
 from sb3_mcbs.models import ForwardModelError
-from sb3_mcbs.networks.functions import policy_function, soft_policy_function
-from tests.conftest import snapshot_vec_env
+from sb3_mcbs.networks.functions import STOCHASTIC, policy_function, soft_policy_function
+from tests.conftest import SEARCHING, snapshot_vec_env
 
-AGENTS = [MCBSTD3, MCBSDDPG, MCBSSAC, MCBSTQC]
+AGENTS = SEARCHING
 STEPS = 3
 GAMMA = 0.9
 
@@ -83,7 +84,7 @@ def go_on(agent, env, snapshot, reward, next_observation):
     total, observation, terminated = scaled(reward), next_observation, False
     for length in range(1, STEPS + 1):
         scaled_action = policy(seen(observation))
-        bonus = entropy(agent, seen(observation), scaled_action)[0] if isinstance(agent, MCBSSAC) else 0.0
+        bonus = entropy(agent, seen(observation), scaled_action)[0] if isinstance(agent, STOCHASTIC) else 0.0
         observation, reward, terminated, _, _ = env.step(agent.policy.unscale_action(scaled_action)[0])
         total += GAMMA**length * (scaled(reward) + bonus)
         if terminated:
@@ -92,7 +93,9 @@ def go_on(agent, env, snapshot, reward, next_observation):
 
 
 @pytest.mark.parametrize("normalized", [False, True])
-@pytest.mark.parametrize(("env_id", "cls"), [("Hopper-v5", MCBSTD3), ("HalfCheetah-v5", MCBSSAC)])
+@pytest.mark.parametrize(
+    ("env_id", "cls"), [("Hopper-v5", MCBSTD3), ("HalfCheetah-v5", MCBSSAC), ("HalfCheetah-v5", MCBSCrossQ)]
+)
 def test_samples_are_those_of_a_plain_loop(make_agent, env_id, cls, normalized):
     vec_env = VecNormalize(snapshot_vec_env(env_id, 2)) if normalized else snapshot_vec_env(env_id, 2)
     agent, taken = trained(make_agent, env_id, cls=cls, env=vec_env)
@@ -218,7 +221,14 @@ def test_every_executed_action_is_as_it_is_simulated(make_agent, cls, dtype):
 
 @pytest.mark.parametrize(
     "cls, sde, ent_coef",
-    [(MCBSSAC, False, 0.2), (MCBSTQC, False, "auto_0.2"), (MCBSSAC, False, "auto_0.2"), (MCBSSAC, True, 0.2)],
+    [
+        (MCBSSAC, False, 0.2),
+        (MCBSTQC, False, "auto_0.2"),
+        (MCBSSAC, False, "auto_0.2"),
+        (MCBSSAC, True, 0.2),
+        (MCBSCrossQ, False, "auto_0.2"),
+        (MCBSCrossQ, True, 0.2),
+    ],
 )
 def test_soft_actions_and_their_entropy_are_sb3s(make_agent, cls, sde, ent_coef):
     agent = make_agent("Hopper-v5", cls=cls, use_sde=sde, ent_coef=ent_coef)
@@ -236,6 +246,20 @@ def test_soft_actions_and_their_entropy_are_sb3s(make_agent, cls, sde, ent_coef)
     np.testing.assert_allclose(actions.mean(axis=0), theirs.detach().mean(dim=0), atol=0.05)
     np.testing.assert_allclose(actions.std(axis=0), theirs.detach().std(dim=0), atol=0.05)
     assert bonus.mean() == pytest.approx(-0.2 * log_prob.mean().item(), abs=0.05)
+
+
+def test_statistics_of_crossq_are_of_its_own_batches_only(make_agent):
+    """Neither expansion, which CrossQ's ``train`` asks for in training mode, nor a search is a batch."""
+    agent, _ = trained(make_agent, cls=MCBSCrossQ)
+    env = snapshot_vec_env("Hopper-v5")
+    SearchPolicy(agent, env, seed=0).predict(env.reset())
+
+    def batches(network):
+        return {int(layer.steps) for layer in network.modules() if isinstance(layer, BatchRenorm1d)}
+
+    assert agent.n_decisions > 0 and agent._n_updates > agent.policy_delay
+    assert batches(agent.critic) == {agent._n_updates}
+    assert batches(agent.actor) == {agent._n_updates // agent.policy_delay}
 
 
 def test_rows_that_somebody_else_adds_are_not_expanded(make_agent):

@@ -2,6 +2,7 @@
 
 from sb3_mcbs.agents.learned_model import EnsembleSettings
 from sb3_mcbs.agents.mcbs import MCBS
+from sb3_mcbs.agents.mcbs_crossq import MCBSCrossQ
 from sb3_mcbs.agents.mcbs_ddpg import MCBSDDPG
 from sb3_mcbs.agents.mcbs_sac import MCBSSAC
 from sb3_mcbs.agents.mcbs_td3 import MCBSTD3
@@ -16,6 +17,7 @@ __all__ = [
     "MCBSTD3",
     "MCBSTQC",
     "EnsembleSettings",
+    "MCBSCrossQ",
     "ScheduleSettings",
     "SearchPolicy",
 ]

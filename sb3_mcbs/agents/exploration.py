@@ -3,10 +3,10 @@
 import logging
 
 import numpy as np
-from sb3_contrib import TQC
-from stable_baselines3 import SAC
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+from sb3_mcbs.networks.functions import STOCHASTIC
 
 logger = logging.getLogger("sb3_mcbs")
 
@@ -19,7 +19,7 @@ def noise_without_search(agent: OffPolicyAlgorithm, noise: float, say: bool = Tr
     :param say: whether to inform the user.
     :return: ``None`` if the agent needs none.
     """
-    if agent.action_noise is not None or isinstance(agent, SAC | TQC):
+    if agent.action_noise is not None or isinstance(agent, STOCHASTIC):
         return None
     message = (
         "action_noise is None, and not every decision is searched: where the actor acts, Gaussian noise of "

@@ -448,8 +448,8 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
         :param observation: the input observation
         :param state: not used
         :param episode_start: not used
-        :param deterministic: whether SAC and TQC take their mean action instead of a sample; the actors of
-            TD3 and DDPG are deterministic
+        :param deterministic: whether SAC, TQC and CrossQ take their mean action instead of a sample; the
+            actors of TD3 and DDPG are deterministic
         :return: the actor's action and ``state``
         """
         return super().predict(observation, state, episode_start, deterministic)

@@ -46,7 +46,7 @@ class Planner:
     A copy makes its forward model at its first use: during unpickling, related objects are incomplete, and
     ``VecNormalize`` has no environments.
 
-    :param agent: a TD3, DDPG, SAC or TQC agent.
+    :param agent: a TD3, DDPG, SAC, TQC or CrossQ agent.
     :param vec_env: the environments; those in this process are wrapped in place.
     :param settings: settings of the search.
     :param normalize_reward: see :class:`~sb3_mcbs.SearchPolicy`.

@@ -41,12 +41,12 @@ class SearchPolicy(RefusesOldNames, Searching):
         policy = SearchPolicy(model, vec_env, beam_width=6, rollout_depth=3)
         evaluate_policy(policy, vec_env)
 
-    SAC and TQC propose their mean action; TQC's value is the mean over all quantiles.
+    SAC, TQC and CrossQ propose their mean action; TQC's value is the mean over all quantiles.
     Settings are attributes: setting one (``policy.beam_width = 20``) applies from the next decision on, and
     ``policy.settings = ...`` sets them all. Other attributes are those of the agent (``save``, ``get_env``,
     ``logger``, ...).
 
-    :param model: a TD3, DDPG, SAC or TQC agent, or one that searched in training (
+    :param model: a TD3, DDPG, SAC, TQC or CrossQ agent, or one that searched in training (
         :class:`~sb3_mcbs.MCBS`)
     :param vec_env: the environment to act in. Further ``VecEnv`` wrappers around it must not alter anything.
         Environments in this process are wrapped for snapshots in place. A ``gym.Env`` must have

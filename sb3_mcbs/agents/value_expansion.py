@@ -1,7 +1,7 @@
 """Critic targets that are rolled forward in the simulator: model-based value expansion.
 
-From the stored state after a transition, the simulator takes the actions of the current target actor (SAC
-and TQC: sampled from the current actor, with an entropy term at every step as in their own targets;
+From the stored state after a transition, the simulator takes the actions of the current target actor (SAC,
+TQC and CrossQ: sampled from the current actor, with an entropy term at every step as in their own targets;
 Feinberg et al., 2018, with the simulator as the model). The target then bootstraps from the critics: rewards
 are exact, actions are not old ones as with ``n_steps``, and values propagate several steps per update.
 """
@@ -15,8 +15,6 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch as th
-from sb3_contrib import TQC
-from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples, RolloutReturn
@@ -26,7 +24,7 @@ from sb3_mcbs.agents.checked_rollouts import CheckedRollouts
 from sb3_mcbs.agents.planner import Planner
 from sb3_mcbs.agents.roots import Prediction
 from sb3_mcbs.models import ForwardModelError
-from sb3_mcbs.networks.functions import policy_function, soft_policy_function
+from sb3_mcbs.networks.functions import STOCHASTIC, policy_function, soft_policy_function
 from sb3_mcbs.networks.torch_settings import one_thread
 from sb3_mcbs.search import SearchSettings
 from sb3_mcbs.search.checks import CheckedSettings
@@ -326,7 +324,7 @@ def target_actor(
     agent: Any,
 ) -> Callable[[Observations, np.random.Generator], tuple[np.ndarray, np.ndarray]]:
     """The current actor of the targets: returns actions and their entropy bonus."""
-    if isinstance(agent, SAC | TQC):
+    if isinstance(agent, STOCHASTIC):
         return soft_policy_function(agent)
     policy = policy_function(agent, target=True)
     return lambda observations, rng: (policy(observations), np.zeros(len(observations)))

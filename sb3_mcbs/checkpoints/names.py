@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch as th
+from sb3_contrib.crossq import policies as crossq_policies
 from sb3_contrib.tqc import policies as tqc_policies
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common import buffers, noise, running_mean_std, torch_layers, type_aliases, utils
@@ -40,7 +41,7 @@ _CLASSES: tuple[type, ...] = (
 
 @functools.cache
 def _own_names() -> dict[str, Any]:
-    policies = (td3_policies, sac_policies, tqc_policies)
+    policies = (td3_policies, sac_policies, tqc_policies, crossq_policies)
     networks = [
         cls
         for module in policies

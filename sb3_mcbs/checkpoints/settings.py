@@ -289,10 +289,13 @@ def check_settings(saved: Encoded, ours: Encoded) -> None:
         raise CheckpointError(
             f"The checkpoint is of a {saved.json['class']}, the agent is a {ours.json['class']}."
         )
-    theirs, mine = saved.json["settings"], ours.json["settings"]
-    _refuse_removed(theirs, mine)
+    _refuse_removed(saved.json["settings"], ours.json["settings"])
+    theirs, mine = (
+        {name: _content(value, each.json["nodes"]) for name, value in each.json["settings"].items()}
+        for each in (saved, ours)
+    )
     differ = sorted(name for name in theirs.keys() | mine.keys() if theirs.get(name) != mine.get(name))
-    same_content = saved.json["nodes"] == ours.json["nodes"] and all(
+    same_content = all(
         name in ours.arrays and np.array_equal(array, ours.arrays[name])
         for name, array in saved.arrays.items()
     )
@@ -301,6 +304,26 @@ def check_settings(saved: Encoded, ours: Encoded) -> None:
         raise CheckpointError(
             f"The agent was made with other settings than the run of the checkpoint: {what}."
         )
+
+
+def _content(value: Any, nodes: list[Any], within: tuple[int, ...] = ()) -> Any:
+    """Follow references, and sort dictionaries by their keys: RL Zoo sorts what it saves with a run.
+
+    :param value: encoded.
+    :param nodes: what it refers to.
+    :param within: the nodes that the value is part of.
+    """
+    if isinstance(value, dict):
+        number = value.get("ref")
+        if number is None or number in within:
+            return {key: _content(part, nodes, within) for key, part in value.items()}
+        return _content(nodes[number], nodes, (*within, number))
+    if isinstance(value, list):
+        parts = [_content(part, nodes, within) for part in value]
+        if len(parts) == 2 and parts[0] == "dict":
+            return ["dict", {"tuple": sorted(parts[1]["tuple"], key=repr)}]
+        return parts
+    return value
 
 
 def _refuse_removed(theirs: dict[str, Any], known: Iterable[str]) -> None:

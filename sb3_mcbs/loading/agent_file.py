@@ -81,13 +81,17 @@ def _read_tensors(content: bytes) -> dict[str, th.Tensor]:
     for name, tensor in state.items():
         if not bool(th.isfinite(tensor).all()):
             raise AgentFileError(f"tensor {name!r} has values that are infinite or not a number.")
+        if name.endswith(".ra_var") and bool((tensor < 0).any()):
+            raise AgentFileError(f"tensor {name!r} has variances below 0.")
     return {name: tensor.detach() for name, tensor in state.items()}
 
 
 def _check_kind(name: Any, tensor: Any) -> None:
     if not isinstance(name, str) or type(tensor) not in (th.Tensor, nn.Parameter):
         raise AgentFileError(f"'policy.pth' must hold only tensors by name; {str(name)[:80]!r} is not.")
-    if tensor.dtype != th.float32 or tensor.layout != th.strided or tensor.device.type != "cpu":
+    is_counter = tensor.dtype == th.int64 and tensor.dim() == 0  # of batch renormalization
+    is_number = tensor.dtype == th.float32 or is_counter
+    if not is_number or tensor.layout != th.strided or tensor.device.type != "cpu":
         raise AgentFileError(
             f"tensor {name[:80]!r} must be dense float32, got {tensor.layout} {tensor.dtype} on "
             f"{tensor.device}."

@@ -19,13 +19,15 @@ _USE_SB3 = "If you trust its author, use the load method of the SB3 algorithm: i
 class Architecture:
     """Sizes of multi-layer perceptrons.
 
-    :param stochastic: whether the actor has a standard deviation (SAC, TQC).
+    :param stochastic: whether the actor has a standard deviation (SAC, TQC, CrossQ).
     :param actor: the actor's hidden layers.
     :param critic: each critic's hidden layers.
     :param n_critics: how many critics there are.
     :param n_outputs: a critic's outputs; with several they are quantiles (TQC).
     :param use_sde: whether the exploration depends on the state (gSDE).
     :param clips_mean: whether the actor clips its mean before squashing it; only with gSDE.
+    :param has_targets: whether there are target networks (all but CrossQ).
+    :param normalizes: whether layers' inputs are normalized over batches; only of CrossQ.
     """
 
     stochastic: bool
@@ -35,6 +37,8 @@ class Architecture:
     n_outputs: int
     use_sde: bool
     clips_mean: bool
+    has_targets: bool
+    normalizes: bool
 
 
 def check_spaces(observation_space: spaces.Space, action_space: spaces.Space) -> None:
@@ -93,14 +97,20 @@ def _infer(shapes: Mapping[str, Shape]) -> Architecture:
                 f"the networks of an MlpPolicy can be inferred from a file's tensors. {_USE_SB3}"
             )
     stochastic = any(name.startswith("actor.log_std") for name in shapes)
-    actor = _widths(shapes, "actor.latent_pi" if stochastic else "actor.mu")
-    critic = _widths(shapes, "critic.qf0")
+    normalizes = "critic.qf0.0.ra_mean" in shapes
+    actor = _widths(shapes, "actor.latent_pi" if stochastic else "actor.mu", normalizes)
+    critic = _widths(shapes, "critic.qf0", normalizes)
     if not critic or not (actor or stochastic):
         raise AgentFileError(
-            "The policy's tensors are not those of a TD3, DDPG, SAC or TQC agent: these have "
+            "The policy's tensors are not those of a TD3, DDPG, SAC, TQC or CrossQ agent: these have "
             f"'actor.*' and 'critic.qf0.*'; the file has {str(sorted(shapes)[:4])[:200]}."
         )
-    critic_indices = itertools.takewhile(lambda i: f"critic.qf{i}.0.weight" in shapes, itertools.count())
+    first = int(normalizes)
+    critic_indices = itertools.takewhile(
+        lambda i: f"critic.qf{i}.{first}.weight" in shapes, itertools.count()
+    )
+    targets = any(name.startswith("critic_target.") for name in shapes)
+    is_crossq = normalizes or (stochastic and critic[-1] == 1 and not targets)
     return Architecture(
         stochastic=stochastic,
         actor=actor if stochastic else actor[:-1],
@@ -109,21 +119,27 @@ def _infer(shapes: Mapping[str, Shape]) -> Architecture:
         n_outputs=critic[-1],
         use_sde="actor.log_std" in shapes,
         clips_mean="actor.mu.0.weight" in shapes,
+        has_targets=not is_crossq,
+        normalizes=normalizes,
     )
 
 
-def _widths(shapes: Mapping[str, Shape], prefix: str) -> list[int]:
-    weights = (shapes.get(f"{prefix}.{index}.weight") for index in itertools.count(0, 2))
+def _widths(shapes: Mapping[str, Shape], prefix: str, normalizes: bool) -> list[int]:
+    indices = itertools.count(1, 3) if normalizes else itertools.count(0, 2)
+    weights = (shapes.get(f"{prefix}.{index}.weight") for index in indices)
     return [shape[0] for shape in itertools.takewhile(bool, weights) if shape]
 
 
 def _expected_shapes(architecture: Architecture, n_features: int, n_actions: int) -> dict[str, Shape]:
     """The shapes of all parameters that an SB3 policy of this architecture has, by name."""
     shapes: dict[str, Shape] = {}
+    normalizes = architecture.normalizes
     if architecture.stochastic:
         latent = [n_features, *architecture.actor]
         last = (latent[-1], n_actions)
-        shapes |= _layers("actor.latent_pi", latent)
+        shapes |= _layers("actor.latent_pi", latent, normalizes)
+        if normalizes and architecture.actor:
+            shapes |= _normalization(f"actor.latent_pi.{3 * len(architecture.actor)}", latent[-1])
         if architecture.use_sde:
             mean = "actor.mu.0" if architecture.clips_mean else "actor.mu"
             shapes |= _linear(mean, *last) | {"actor.log_std": last}
@@ -133,8 +149,9 @@ def _expected_shapes(architecture: Architecture, n_features: int, n_actions: int
         for actor in ("actor", "actor_target"):
             shapes |= _layers(f"{actor}.mu", [n_features, *architecture.actor, n_actions])
     critic = [n_features + n_actions, *architecture.critic, architecture.n_outputs]
-    for name, index in itertools.product(("critic", "critic_target"), range(architecture.n_critics)):
-        shapes |= _layers(f"{name}.qf{index}", critic)
+    critics = ("critic", "critic_target") if architecture.has_targets else ("critic",)
+    for name, index in itertools.product(critics, range(architecture.n_critics)):
+        shapes |= _layers(f"{name}.qf{index}", critic, normalizes)
     return shapes
 
 
@@ -142,9 +159,18 @@ def _linear(name: str, n_inputs: int, n_outputs: int) -> dict[str, Shape]:
     return {f"{name}.weight": (n_outputs, n_inputs), f"{name}.bias": (n_outputs,)}
 
 
-def _layers(prefix: str, widths: list[int]) -> dict[str, Shape]:
+def _normalization(name: str, n: int) -> dict[str, Shape]:
+    parts = ("scale", "bias", "ra_mean", "ra_var")
+    return {f"{name}.steps": (), **{f"{name}.{part}": (n,) for part in parts}}
+
+
+def _layers(prefix: str, widths: list[int], normalizes: bool = False) -> dict[str, Shape]:
     shapes: dict[str, Shape] = {}
     for index, (n_inputs, n_outputs) in enumerate(itertools.pairwise(widths)):
-        # Every second module is an activation function, which has no parameters.
-        shapes |= _linear(f"{prefix}.{2 * index}", n_inputs, n_outputs)
+        # The last module of every layer is an activation function, which has no parameters.
+        if normalizes:
+            shapes |= _normalization(f"{prefix}.{3 * index}", n_inputs)
+            shapes |= _linear(f"{prefix}.{3 * index + 1}", n_inputs, n_outputs)
+        else:
+            shapes |= _linear(f"{prefix}.{2 * index}", n_inputs, n_outputs)
     return shapes

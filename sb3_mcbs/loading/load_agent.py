@@ -9,8 +9,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 import torch as th
-from sb3_contrib import TQC
-from stable_baselines3 import SAC
+from sb3_contrib import TQC, CrossQ
 from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
@@ -23,6 +22,7 @@ from sb3_mcbs.loading.agent_file import AgentFile, is_pickled, read_agent_file
 from sb3_mcbs.loading.architecture import Architecture, check_spaces, read_architecture
 from sb3_mcbs.loading.archive import AgentFileError, about
 from sb3_mcbs.loading.network_settings import is_number, network_settings
+from sb3_mcbs.networks.functions import STOCHASTIC
 from sb3_mcbs.search import SearchSettings, make_settings
 from sb3_mcbs.search.settings import KEYWORDS
 
@@ -48,14 +48,14 @@ def load_agent(
     name of the entry or member. It is also logged (``sb3_mcbs``), as a warning if it may change how the agent
     acts.
 
-    :param path: the file, as ``save`` of TD3, DDPG, SAC, TQC or one of their MCBS agents wrote it, with an
-        ``MlpPolicy``
+    :param path: the file, as ``save`` of TD3, DDPG, SAC, TQC, CrossQ or one of their MCBS agents wrote it,
+        with an ``MlpPolicy``
     :param env: the environment to act in; its spaces must be those of the training
-    :param algo: ``"td3"``, ``"ddpg"``, ``"sac"``, ``"tqc"``, or one of these after ``"mcbs_"``; by default
-        it is inferred from the file
+    :param algo: ``"td3"``, ``"ddpg"``, ``"sac"``, ``"tqc"``, ``"crossq"``, or one of these after
+        ``"mcbs_"``; by default it is inferred from the file
     :param policy_kwargs: those of the training, for files that hold no readable copy of them. Only those are
         needed that cannot be inferred from tensors: ``activation_fn``, with gSDE ``clip_mean`` and
-        ``use_expln``.
+        ``use_expln``, of CrossQ ``batch_norm_eps``.
     :param device: device on which the networks run
     :return: the agent, ready to act
     :raises FileNotFoundError: if there is no such file
@@ -90,7 +90,7 @@ def _algorithm(file: AgentFile, architecture: Architecture, algo: str | None) ->
     if algo is None:
         if architecture.stochastic:
             is_tqc = architecture.n_outputs > 1 or "top_quantiles_to_drop_per_net" in file.data
-            algo = "tqc" if is_tqc else "sac"
+            algo = "tqc" if is_tqc else "sac" if architecture.has_targets else "crossq"
         else:
             algo = "ddpg" if architecture.n_critics == 1 else "td3"
         if "beam_width" in file.data:
@@ -99,11 +99,13 @@ def _algorithm(file: AgentFile, architecture: Architecture, algo: str | None) ->
         raise ValueError(f"algo must be one of {list(ALGORITHMS)}, got {algo!r}.")
     cls = ALGORITHMS[algo]
     one_output = architecture.n_outputs == 1 or issubclass(cls, TQC)
-    if architecture.stochastic != issubclass(cls, SAC | TQC) or not one_output:
+    targets = architecture.has_targets != issubclass(cls, CrossQ)
+    if architecture.stochastic != issubclass(cls, STOCHASTIC) or not one_output or not targets:
         kind = "a stochastic" if architecture.stochastic else "a deterministic"
         raise AgentFileError(
-            f"The file is not of the algorithm {algo!r}: it has {kind} actor and critics with "
-            f"{architecture.n_outputs} output(s)."
+            f"The file is not of the algorithm {algo!r}: it has {kind} actor, critics with "
+            f"{architecture.n_outputs} output(s), and {'' if architecture.has_targets else 'no '}target "
+            "networks."
         )
     return algo
 
@@ -119,7 +121,7 @@ def _numbers(file: AgentFile, algo: str, architecture: Architecture) -> tuple[di
     checks: dict[str, tuple[Callable[[Any], bool], str]] = {
         "gamma": (lambda value: is_number(value) and 0 < value <= 1, "a number above 0 and up to 1")
     }
-    if issubclass(ALGORITHMS[algo], SAC | TQC):
+    if issubclass(ALGORITHMS[algo], STOCHASTIC):
         checks["ent_coef"] = (_is_entropy_coefficient, "a number from 0 or 'auto'")
     if issubclass(ALGORITHMS[algo], TQC):
         checks["top_quantiles_to_drop_per_net"] = (
@@ -187,7 +189,7 @@ def _build(
     device: th.device | str,
     tensors: dict[str, th.Tensor],
 ) -> OffPolicyAlgorithm:
-    settings = numbers | ({"use_sde": use_sde} if issubclass(cls, SAC | TQC) else {})
+    settings = numbers | ({"use_sde": use_sde} if issubclass(cls, STOCHASTIC) else {})
     agent = cls(
         "MlpPolicy",
         env,

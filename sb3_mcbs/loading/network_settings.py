@@ -1,4 +1,4 @@
-"""Policy settings that cannot be inferred from tensors: the activation function, and those of gSDE."""
+"""Policy settings that cannot be inferred from tensors, such as the activation function."""
 
 import re
 import sys
@@ -24,13 +24,15 @@ ACTIVATIONS: dict[str, type[nn.Module]] = {
 _ARGUMENTS = {
     "net_arch", "n_critics", "n_quantiles", "use_sde", "log_std_init", "share_features_extractor",
     "normalize_images", "optimizer_class", "optimizer_kwargs", "features_extractor_kwargs", "device",
-    "activation_fn", "clip_mean", "use_expln", "features_extractor_class",
+    "activation_fn", "clip_mean", "use_expln", "features_extractor_class", "batch_norm", "batch_norm_eps",
+    "batch_norm_momentum", "renorm_warmup_steps",
 }  # fmt: skip
 
 _POLICIES = {
     "stable_baselines3.td3.policies": "TD3Policy",
     "stable_baselines3.sac.policies": "SACPolicy",
     "sb3_contrib.tqc.policies": "TQCPolicy",
+    "sb3_contrib.crossq.policies": "CrossQPolicy",
 }
 
 _SAY_IT = "Pass policy_kwargs= as it was trained with, for example policy_kwargs=dict(activation_fn=nn.ReLU)."
@@ -68,6 +70,8 @@ def network_settings(
         "n_critics": architecture.n_critics,
         "activation_fn": _activation(given),
     }
+    if not architecture.has_targets:
+        settings |= {"batch_norm": architecture.normalizes, "batch_norm_eps": _normalization_eps(given)}
     return settings | (_sde_settings(given, architecture) if architecture.use_sde else {})
 
 
@@ -97,6 +101,13 @@ def _activation(given: Mapping[str, Any]) -> type[nn.Module]:
             f"The activation function {str(activation)[:80]!r} is not one that is known. {_SAY_IT}"
         )
     return ACTIVATIONS[activation]
+
+
+def _normalization_eps(given: Mapping[str, Any]) -> float:
+    eps = given.get("batch_norm_eps", 0.001)
+    if not is_number(eps) or eps <= 0:
+        raise AgentFileError(f"batch_norm_eps must be a number above 0, got {str(eps)[:80]!r}.")
+    return eps
 
 
 def _sde_settings(given: Mapping[str, Any], architecture: Architecture) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from sb3_contrib import TQC
+from sb3_contrib import TQC, CrossQ
 from stable_baselines3 import DDPG, SAC, TD3
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
@@ -22,14 +22,16 @@ from sb3_mcbs.networks.mlp import MLP
 from sb3_mcbs.networks.plain_networks import actor_mlp, critic_mlps
 from sb3_mcbs.types import Observations
 
-SUPPORTED = (TD3, DDPG, SAC, TQC)
+#: Agents whose actor is a squashed Gaussian, and whose targets have an entropy term.
+STOCHASTIC = (SAC, TQC, CrossQ)
+SUPPORTED = (TD3, DDPG, *STOCHASTIC)
 
 
 def check_agent(agent: OffPolicyAlgorithm) -> None:
     """Refuse an agent whose actor and critics a search cannot use.
 
     :param agent: the agent.
-    :raises TypeError: if it is not TD3, DDPG, SAC or TQC (or a subclass).
+    :raises TypeError: if it is not TD3, DDPG, SAC, TQC or CrossQ (or a subclass).
     :raises ValueError: if its actions are not a bounded Box.
     """
     if not isinstance(agent, SUPPORTED):
@@ -60,14 +62,14 @@ def _to_numpy(tensor: th.Tensor, device: th.device) -> np.ndarray:
 
 
 def policy_function(agent: OffPolicyAlgorithm, target: bool = False) -> Callable[[Observations], np.ndarray]:
-    """The actor without exploration: its output (TD3, DDPG) or its squashed mean (SAC, TQC).
+    """The actor without exploration: its output (TD3, DDPG) or its squashed mean (others).
 
     :param agent: a supported agent.
     :param target: for training instead of acting: the target actor, if there is one.
     :return: observations ``[rows, *obs_shape]`` -> float32 actions ``[rows, act_dim]`` in [-1, 1].
     """
     own: Any = agent
-    stochastic = isinstance(agent, SAC | TQC)
+    stochastic = isinstance(agent, STOCHASTIC)
     # SB3 trains what the agent holds, and acts with what its policy holds.
     actor = own.policy.actor if not target else own.actor if stochastic else own.actor_target
     with suppress(TypeError):
@@ -138,12 +140,15 @@ def soft_policy_function(
 ) -> Callable[[Observations, np.random.Generator], tuple[np.ndarray, np.ndarray]]:
     """Sample the stochastic actor that is trained, and compute its entropy bonus.
 
-    :param agent: a SAC or TQC agent.
+    :param agent: one of :data:`STOCHASTIC`.
     :return: observations ``[rows, *obs_shape]``, generator of the noise -> float32 actions
         ``[rows, act_dim]`` in [-1, 1], and their entropy bonus ``-ent_coef * log pi(a|s)``, ``[rows]``.
     """
     own: Any = agent
     actor, device = own.actor, agent.device
+    if isinstance(agent, CrossQ):
+        # Its ``train`` samples in training mode, in which every call changes the actor's running statistics.
+        actor.set_bn_training_mode(False)
 
     def draw(observations: Observations, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         with th.no_grad():

@@ -7,6 +7,7 @@ For the small networks of continuous control these cost as much as the matrix pr
 from typing import Any
 
 import torch as th
+from sb3_contrib.common.torch_layers import BatchRenorm1d
 from torch import nn
 
 
@@ -56,6 +57,10 @@ class _Linear:
             _check_parameter(self.bias)
 
     @property
+    def device(self) -> th.device:
+        return self.weight.device
+
+    @property
     def column(self) -> th.Tensor:
         """The bias as ``[out_features, 1]``."""
         if self._column is None:
@@ -73,8 +78,42 @@ class _Linear:
             th.sum(gradient, 1, out=_gradient_of(self.bias))
 
 
-def _check_parameter(parameter: th.Tensor) -> None:
-    if type(parameter) is not nn.Parameter or parameter.dtype != th.float32 or not parameter.is_contiguous():
+class _Normalization:
+    """Batch renormalization in evaluation mode, with the present parameters and running statistics.
+
+    :param layer: the layer.
+    :raises TypeError: if it has other parameters or statistics than SB3-Contrib gives it.
+    """
+
+    __slots__ = ("_columns",)
+
+    def __init__(self, layer: BatchRenorm1d) -> None:
+        state = own_state(layer)
+        parameters, statistics = state["_parameters"], state["_buffers"]
+        named = [*parameters, *statistics] == ["scale", "bias", "ra_mean", "ra_var", "steps"]
+        if not named or not layer.affine or state["_modules"]:
+            raise TypeError("a BatchRenorm1d has other parameters or statistics than SB3-Contrib's")
+        (scale, bias), (mean, variance, _) = parameters.values(), statistics.values()
+        for tensor in (scale, bias):
+            _check_parameter(tensor)
+        for tensor in (mean, variance):
+            _check_parameter(tensor, th.Tensor)
+        with th.no_grad():
+            deviation = (variance + layer.eps).sqrt_()
+            self._columns = [each.unsqueeze(1) for each in (mean, deviation, scale, bias)]
+
+    @property
+    def device(self) -> th.device:
+        return self._columns[0].device
+
+    def __call__(self, x: th.Tensor) -> th.Tensor:
+        # The layer's own operations in its order: the result is equal to the bit.
+        mean, deviation, scale, bias = self._columns
+        return (x - mean).div_(deviation).mul_(scale).add_(bias)
+
+
+def _check_parameter(parameter: th.Tensor, kind: type[th.Tensor] = nn.Parameter) -> None:
+    if type(parameter) is not kind or parameter.dtype != th.float32 or not parameter.is_contiguous():
         raise TypeError("parameters are not float32, not contiguous, or of a class of their own")
 
 
@@ -87,14 +126,15 @@ def _gradient_of(parameter: nn.Parameter) -> th.Tensor:
 class MLP:
     """Linear layers with ReLU and Tanh between them, to be called without autograd.
 
-    It keeps the layers and parameters that the modules have when it is made.
+    It keeps the layers and parameters that the modules have when it is made. Batch renormalization is that of
+    evaluation mode, with the statistics at that time.
 
     :param modules: ``nn.Sequential``s and single layers.
     :raises TypeError: if a layer is of another kind, or calling it would do more than compute its output.
     """
 
     def __init__(self, *modules: nn.Module) -> None:
-        self._layers: list[_Linear | type[nn.Module]] = []
+        self._layers: list[_Linear | _Normalization | type[nn.Module]] = []
         for module in modules:
             self._append(module)
         if not self._layers:
@@ -104,11 +144,14 @@ class MLP:
         if type(module) is nn.Linear:
             self._layers.append(_Linear(module))
             return
+        if type(module) is BatchRenorm1d:
+            self._layers.append(_Normalization(module))
+            return
         is_activation = type(module) in (nn.ReLU, nn.Tanh) and self._layers
         if type(module) is not nn.Sequential and not is_activation:
             raise TypeError(
-                f"{type(module).__name__} is not covered; an MLP begins with Linear and continues with "
-                "Linear, ReLU and Tanh"
+                f"{type(module).__name__} is not covered; an MLP begins with Linear or BatchRenorm1d "
+                "and continues with these, ReLU and Tanh"
             )
         state = own_state(module)
         if state["_parameters"] or (is_activation and state["_modules"]):
@@ -122,14 +165,19 @@ class MLP:
     def device(self) -> th.device:
         """The device of the first layer."""
         first = self._layers[0]
-        assert isinstance(first, _Linear)
-        return first.weight.device
+        assert isinstance(first, _Linear | _Normalization)
+        return first.device
 
     @property
     def parameters(self) -> list[nn.Parameter]:
-        """In the order of the layers."""
+        """In the order of the layers.
+
+        :raises TypeError: if there are layers that :meth:`backward` does not cover.
+        """
         found = []
         for layer in self._layers:
+            if isinstance(layer, _Normalization):
+                raise TypeError("BatchRenorm1d is trained on the statistics of batches")
             if isinstance(layer, _Linear):
                 found.append(layer.weight)
                 if layer.bias is not None:
@@ -156,6 +204,8 @@ class MLP:
                 x = th.mm(layer.weight, x)
                 if layer.bias is not None:
                     x += layer.column
+            elif isinstance(layer, _Normalization):
+                x = layer(x)
             else:
                 x = x.relu_() if layer is nn.ReLU else x.tanh_()
             outputs.append(x)

@@ -8,6 +8,9 @@ from typing import Any
 
 import torch as th
 from gymnasium import spaces
+from sb3_contrib.common.torch_layers import BatchRenorm1d
+from sb3_contrib.crossq.policies import Actor as CrossQActor
+from sb3_contrib.crossq.policies import CrossQCritic
 from sb3_contrib.tqc.policies import Actor as TQCActor
 from sb3_contrib.tqc.policies import Critic as TQCCritic
 from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution
@@ -23,8 +26,10 @@ from torch.optim import optimizer as torch_optimizer
 from sb3_mcbs.networks.mlp import MLP, own_state
 
 #: Subclasses and wrappers are not included, since they may do something else.
-_NETWORKS: tuple[type[nn.Module], ...] = (TD3Actor, SACActor, TQCActor, ContinuousCritic, TQCCritic)
-_LAYERS = (nn.Linear, nn.ReLU, nn.Tanh, nn.Sequential, nn.Flatten, FlattenExtractor)
+_STOCHASTIC_ACTORS: tuple[type[nn.Module], ...] = (SACActor, TQCActor, CrossQActor)
+_CRITICS: tuple[type[nn.Module], ...] = (ContinuousCritic, TQCCritic, CrossQCritic)
+_NETWORKS = (TD3Actor, *_STOCHASTIC_ACTORS, *_CRITICS)
+_LAYERS = (nn.Linear, BatchRenorm1d, nn.ReLU, nn.Tanh, nn.Sequential, nn.Flatten, FlattenExtractor)
 
 
 _METHODS = {
@@ -40,8 +45,7 @@ _CALLED = [
         (nn.Module, "_call_impl"),
         (BaseModel, "extract_features"),
         (ContinuousCritic, "q1_forward"),
-        (SACActor, "get_action_dist_params"),
-        (TQCActor, "get_action_dist_params"),
+        *((cls, "get_action_dist_params") for cls in _STOCHASTIC_ACTORS),
     )
 ]
 _TANH = nn.Tanh()
@@ -113,7 +117,7 @@ def actor_mlp(actor: Any) -> MLP:
     modules = _check_plain(actor)
     if type(actor) is TD3Actor:
         return MLP(modules.get("mu"))
-    if type(actor) in (SACActor, TQCActor) and type(actor.action_dist) is SquashedDiagGaussianDistribution:
+    if type(actor) in _STOCHASTIC_ACTORS and type(actor.action_dist) is SquashedDiagGaussianDistribution:
         MLP(modules.get("log_std"))  # is called as well
         return MLP(modules.get("latent_pi"), modules.get("mu"), _TANH)
     raise TypeError(f"{type(actor).__name__} is not an actor whose mean action is an MLP")
@@ -128,7 +132,7 @@ def critic_mlps(critic: Any) -> list[MLP]:
     :raises TypeError: if the critic is more than MLPs.
     """
     _check_plain(critic)
-    if type(critic) not in (ContinuousCritic, TQCCritic):
+    if type(critic) not in _CRITICS:
         raise TypeError(f"{type(critic).__name__} is not a critic of a known kind")
     return [MLP(network) for network in critic.q_networks]
 

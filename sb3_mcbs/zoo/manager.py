@@ -25,7 +25,7 @@ from sb3_mcbs.agents.hyperparameters import (
     refuse_old_names,
     settings_of_preset,
 )
-from sb3_mcbs.agents.registry import SEARCHING
+from sb3_mcbs.agents.registry import BASELINES, SEARCHING
 from sb3_mcbs.agents.schedule import SCHEDULES, UNITS
 from sb3_mcbs.checkpoints import CheckpointError, ExactCheckpointCallback
 from sb3_mcbs.checkpoints.resume import CheckpointedRun
@@ -52,7 +52,7 @@ from sb3_mcbs.zoo.tuning import (
 #: ``-conf sb3_mcbs`` selects this package's file for the algorithm of the command line.
 PACKAGE_CONFIG = "sb3_mcbs"
 #: Algorithms that ``SearchPolicy`` supports.
-SEARCHABLE = ("ddpg", "sac", "td3", "tqc")
+SEARCHABLE = tuple(sorted(BASELINES))
 #: The folder of exact checkpoints within a run's folder.
 CHECKPOINTS = "checkpoints"
 #: The settings that are names, and their valid values.

@@ -102,10 +102,26 @@ def sample_mcbs_params(
         trial.set_user_attr("pruned", reason)
         raise optuna.TrialPruned(f"{reason}: {params}")
     if scope == "all":
-        from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
-
-        params.update(HYPERPARAMS_SAMPLER[base](trial, n_actions, n_envs, additional_args))
+        params.update(_sample_base(base, trial, n_actions, n_envs, additional_args))
     return {**params, **_NO_PRESET}
+
+
+def _sample_base(base: str, trial: optuna.Trial, *arguments: Any) -> dict[str, Any]:
+    """Sample what RL Zoo tunes of the algorithm without search."""
+    from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER, convert_offpolicy_params
+
+    if base != "crossq":
+        return HYPERPARAMS_SAMPLER[base](trial, *arguments)
+    # RL Zoo has no sampler for CrossQ: as its one for SAC, without target networks and HER.
+    return convert_offpolicy_params(
+        {
+            "one_minus_gamma": trial.suggest_float("one_minus_gamma", 0.0001, 0.03, log=True),
+            "learning_rate": trial.suggest_float("learning_rate", 1e-5, 0.002, log=True),
+            "batch_size_pow": trial.suggest_int("batch_size_pow", 2, 11),
+            "train_freq": trial.suggest_int("train_freq", 1, 10),
+            "net_arch": trial.suggest_categorical("net_arch", ["small", "medium", "big"]),
+        }
+    )
 
 
 def _sample_strategy(trial: optuna.Trial) -> dict[str, Any]:
