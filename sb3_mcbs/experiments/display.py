@@ -59,7 +59,8 @@ class Display:
         """
         :param job: a run that was evaluated just now
         """
-        if self._live is None:
+        episode_of_many = job.run.agent is not None and job.step < job.run.steps
+        if self._live is None and not episode_of_many:
             speed, left = _number(job.steps_per_second), _duration(job.seconds_left)
             self.say(
                 f"{job.folder.name}: {job.step} of {job.run.steps} {job.run.unit}, {_returns(job)}"
