@@ -166,6 +166,20 @@ def test_returns_below_zero_are_not_averaged_over_environments(tmp_path: Path) -
     assert rows_of(speed_table(results))["td3_Pendulum-v1_0"]["90 %: steps"] == "–"
 
 
+def test_a_run_that_was_first_evaluated_later_is_not_compared(tmp_path: Path) -> None:
+    for place, steps in ((1, [10]), (2, [8, 16]), (3, [50, 100])):
+        run = tmp_path / "ppo" / f"Pendulum-v1_{place}"
+        run.mkdir(parents=True)
+        results = 100.0 * place + np.array(steps)[:, None]
+        np.savez(run / "evaluations.npz", timesteps=steps, results=results, ep_lengths=results)
+    results = load_results(tmp_path)
+    assert finals(results, "Pendulum-v1", Competitor("ppo", ACTOR)) == [110, 208]
+    assert list(rows_of(episode_table(results))) == ["ppo_Pendulum-v1_1", "ppo_Pendulum-v1_2"]
+    text = " ".join(sections(results)[0].text)
+    assert "Some runs in Pendulum-v1 were not evaluated at that step, but before" in text
+    assert "Not compared in Pendulum-v1, since first evaluated later: ppo_Pendulum-v1_3." in text
+
+
 def test_curves_end_where_a_run_ends_and_show_every_seed(folder: Path) -> None:
     results = load_results(folder)
     curve = learning_curve(results.of(WALKER, MCBS), ACTOR)

@@ -13,7 +13,7 @@ from sb3_mcbs.experiments.report.content import Picture, Table, estimate_text, n
 from sb3_mcbs.experiments.report.curves import curve_pictures, simulates
 from sb3_mcbs.experiments.report.drawing import COLOURS
 from sb3_mcbs.experiments.report.references import published_curves, sources
-from sb3_mcbs.experiments.report.runs import Results, short
+from sb3_mcbs.experiments.report.runs import Results, at, short
 from sb3_mcbs.experiments.report.statistics import MIN_SEEDS, common_step, final_estimate
 from sb3_mcbs.experiments.report.tables import episode_table, machine_table, run_table, speed_table
 from sb3_mcbs.experiments.results import FINISHED
@@ -159,6 +159,15 @@ def _about_returns(results: Results) -> list[str]:
                 f"In {task} runs are compared after {number(step)} environment steps, the most that all of "
                 f"them have reached. {behind[0]}{others} came no further; others have {number(ahead)}."
             )
+        indices = [(run, each, at(each, step)) for run in runs for each in run.policies.values()]
+        if any(index is not None and each.timesteps[index] != step for _, each, index in indices):
+            text.append(
+                f"Some runs in {task} were not evaluated at that step, but before: the table of episodes "
+                "says when."
+            )
+        late = list(dict.fromkeys(run.name for run, _, index in indices if index is None))
+        if late:
+            text.append(f"Not compared in {task}, since first evaluated later: {', '.join(late)}.")
     return text
 
 

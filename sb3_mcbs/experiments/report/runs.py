@@ -301,10 +301,11 @@ def _line(error: Exception) -> str:
     return " ".join(str(error).split())
 
 
-def at(evaluations: Evaluations, step: int) -> int:
+def at(evaluations: Evaluations, step: int) -> int | None:
     """
     :param evaluations: of one policy of a run
     :param step: environment steps
-    :return: which evaluation is the last one until then
+    :return: which evaluation is the last one until then; None: all are later
     """
-    return int(np.searchsorted(evaluations.timesteps, step, side="right")) - 1
+    n_until = int(np.searchsorted(evaluations.timesteps, step, side="right"))
+    return n_until - 1 if n_until else None

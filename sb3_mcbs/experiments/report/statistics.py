@@ -71,11 +71,11 @@ def finals(results: Results, task: str, competitor: Competitor) -> list[float]:
     :param results: of a folder
     :param task: environment or agent
     :param competitor: arm and policy
-    :return: of each run the mean return of the last evaluation until the common step
+    :return: of each run the mean return of the last evaluation until the common step, if it has one
     """
     step = common_step(results, task)
     policies = [run.policies[competitor.policy] for run in results.of(task, competitor)]
-    return [float(each.means[at(each, step)]) for each in policies]
+    return [float(each.means[index]) for each in policies if (index := at(each, step)) is not None]
 
 
 def final_estimate(results: Results, task: str, competitor: Competitor) -> Estimate | None:

@@ -73,6 +73,8 @@ def episode_table(results: Results) -> Table:
         for run in results.of(task):
             for policy, evaluations in run.policies.items():
                 index = at(evaluations, step)
+                if index is None:
+                    continue
                 lengths = evaluations.lengths
                 share = falls(run, evaluations, index)
                 rows.append(
