@@ -345,9 +345,27 @@ def test_a_broken_file_is_named_and_the_others_are_reported(tmp_path: Path) -> N
     lines = report(tmp_path / "logs", tmp_path / "report")
     assert any(str(broken) in line and "is not what an EvalCallback writes" in line for line in lines)
     assert lines[2].endswith("200, 2 runs")
-    assert "Left out, because it could not be read" in check_page(tmp_path / "report" / "report.html")
+    assert "Could not be used" in check_page(tmp_path / "report" / "report.html")
     np.savez(broken, timesteps=[1, 2], results=np.zeros((1, 2)), ep_lengths=np.zeros((1, 2)))
     assert "results has the shape (1, 2)" in " ".join(load_results(tmp_path / "logs").problems)
+    np.savez(broken, timesteps=[2, 1], results=np.zeros((2, 2)))
+    assert "timesteps do not increase" in " ".join(load_results(tmp_path / "logs").problems)
+    np.savez(broken, timesteps=["a"], results=np.zeros((1, 2)))
+    assert "timesteps has values of type <U1" in " ".join(load_results(tmp_path / "logs").problems)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_run_that_diverged_does_not_count_as_the_best(tmp_path: Path, value: float) -> None:
+    for place in range(1, 6):
+        run = tmp_path / "ppo" / f"Pendulum-v1_{place}"
+        run.mkdir(parents=True)
+        last = value if place == 1 else float(place)
+        np.savez(run / "evaluations.npz", timesteps=[10, 20], results=np.array([[1.0], [last]]))
+    results = load_results(tmp_path)
+    estimate = final_estimate(results, "Pendulum-v1", Competitor("ppo", ACTOR))
+    assert estimate is not None and (estimate.value, estimate.n) == (3.5, 4)
+    (problem,) = results.problems
+    assert "Pendulum-v1_1" in problem and "not finite numbers, first after 20 steps" in problem
 
 
 def test_folders_with_nothing_in_them(tmp_path: Path) -> None:

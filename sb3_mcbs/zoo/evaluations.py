@@ -50,7 +50,7 @@ def load_evaluations(folder: str | Path) -> Evaluations:
 
     :param folder: the folder that contains ``evaluations.npz``
     :return: its content
-    :raises PathError: if there is no such folder, or no evaluation in it
+    :raises PathError: if there is no such folder, no evaluation in it, or a return that is no finite number
     """
     path = Path(folder) / "evaluations.npz"
     if not Path(folder).is_dir():
@@ -65,7 +65,14 @@ def load_evaluations(folder: str | Path) -> Evaluations:
             _check(arrays)
     except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
         raise PathError(f"{path} is not what an EvalCallback writes: {error}") from error
-    return Evaluations(**arrays)
+    found = Evaluations(**arrays)
+    broken = np.flatnonzero(~np.isfinite(found.means))
+    if broken.size:
+        raise PathError(
+            f"{path} has returns that are not finite numbers, first after {found.timesteps[broken[0]]} "
+            "steps: the run diverged."
+        )
+    return found
 
 
 def _check(arrays: dict[str, np.ndarray]) -> None:
@@ -75,8 +82,12 @@ def _check(arrays: dict[str, np.ndarray]) -> None:
                 raise KeyError(key)
         elif arrays[name].ndim != n_dimensions or len(arrays[name]) != len(arrays["timesteps"]):
             raise ValueError(f"{key} has the shape {arrays[name].shape}")
+        elif arrays[name].dtype.kind not in "iuf":
+            raise ValueError(f"{key} has values of type {arrays[name].dtype}")
     if not arrays["returns"].size:
         raise ValueError("there is no evaluation in it")
+    if np.any(np.diff(arrays["timesteps"]) <= 0):
+        raise ValueError("timesteps do not increase")
 
 
 def load_policies(run_folder: str | Path) -> dict[str, Evaluations]:
