@@ -290,6 +290,15 @@ def test_names_are_escaped(tmp_path: Path) -> None:
     assert "# &lt;b&gt;&amp;" in check_page(tmp_path / "report" / "report.html")
 
 
+def test_names_of_folders_are_no_markup(tmp_path: Path) -> None:
+    names = ("a$_{$b", "<b>\"&'", "{{7*7}}", "_x")
+    for name in names:
+        zoo(tmp_path / "logs", name)
+    report(tmp_path / "logs", tmp_path / "report")
+    text = check_page(tmp_path / "report" / "report.html")
+    assert "<b>" not in re.sub(r"<li><b>", "", text) and "{{7*7}}: alone" in text and "a$_{$b: alone" in text
+
+
 def test_logs_of_another_algorithm(tmp_path: Path) -> None:
     lines = report(zoo(tmp_path / "logs"), tmp_path / "report")
     assert lines[:3] == [

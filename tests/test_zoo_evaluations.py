@@ -38,6 +38,19 @@ def test_policies_are_told_apart(logs: Path) -> None:
     assert last_means(logs / "sac" / "HalfCheetah-v5_1") == {ACTOR: 5}
 
 
+def test_the_only_policy_of_a_folder_has_its_name(logs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    alone = logs / "copied"
+    alone.mkdir()
+    for name, policy in (("mcbs_td3", SEARCH), ("mcbs_td3_actor", ACTOR), ("td3_search", SEARCH)):
+        (logs / name).rename(alone / name)
+        assert list(load_policies(alone / name / "HalfCheetah-v5_1")) == [policy]
+        (alone / name).rename(logs / name)
+    monkeypatch.chdir(logs / "mcbs_td3")
+    assert last_means(Path("HalfCheetah-v5_1")) == {ACTOR: 20, SEARCH: 30}
+    monkeypatch.chdir("HalfCheetah-v5_1")
+    assert last_means(Path(".")) == {ACTOR: 20, SEARCH: 30}
+
+
 def test_report_says_what_was_reached_and_where_it_lies(logs: Path) -> None:
     folder = logs / "mcbs_td3" / "HalfCheetah-v5_1"
     for name in ("best_model", "HalfCheetah-v5"):

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sb3_mcbs.agents.registry import SEARCHING
 from sb3_mcbs.zoo.paths import PathError, sibling_folder
 
 ACTOR = "actor alone"
@@ -98,11 +99,13 @@ def load_policies(run_folder: str | Path) -> dict[str, Evaluations]:
     :return: evaluations of ``actor alone`` and of ``actor with search``, if available
     """
     own = load_evaluations(run_folder)
+    run_folder = Path(run_folder).absolute()
     if (sibling_folder(run_folder, "actor") / "evaluations.npz").is_file():
         return {ACTOR: load_evaluations(sibling_folder(run_folder, "actor")), SEARCH: own}
     if (sibling_folder(run_folder, "search") / "evaluations.npz").is_file():
         return {ACTOR: own, SEARCH: load_evaluations(sibling_folder(run_folder, "search"))}
-    return {ACTOR: own}
+    algorithm = run_folder.parent.name
+    return {SEARCH if algorithm in SEARCHING or algorithm.endswith("_search") else ACTOR: own}
 
 
 def newest_run(log_folder: str | Path, algo: str, env_id: str) -> Path:

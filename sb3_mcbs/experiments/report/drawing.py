@@ -24,7 +24,7 @@ _STYLE: Any = {
     "axes.facecolor": "none", "axes.edgecolor": MUTED, "axes.labelcolor": INK, "text.color": INK,
     "xtick.color": MUTED, "ytick.color": MUTED, "xtick.labelcolor": INK, "ytick.labelcolor": INK,
     "axes.spines.top": False, "axes.spines.right": False, "grid.color": MUTED, "grid.alpha": 0.25,
-    "legend.frameon": False, "figure.constrained_layout.use": True,
+    "text.parse_math": False, "legend.frameon": False, "figure.constrained_layout.use": True,
 }  # fmt: skip
 #: What the page replaces by its own colours.
 _VARIABLES = {
