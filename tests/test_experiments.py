@@ -133,6 +133,14 @@ def test_another_spec_is_refused(changes: dict, message: str, tmp_path: Path) ->
     assert (tmp_path / "results" / "spec.yml").read_text() == spec.text
 
 
+def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").touch()
+    for place in ("file", "file/results"):
+        monkeypatch.setattr(sys, "argv", ["sb3-mcbs experiment", "smoke", "-o", str(tmp_path / place)])
+        with pytest.raises(SystemExit, match=f"{place} cannot be written: .*--output"):
+            command.main()
+
+
 def test_the_command_checks_and_chooses(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -180,6 +180,16 @@ def test_a_run_that_was_first_evaluated_later_is_not_compared(tmp_path: Path) ->
     assert "Not compared in Pendulum-v1, since first evaluated later: ppo_Pendulum-v1_3." in text
 
 
+def test_why_there_is_no_mean_over_environments(tmp_path: Path) -> None:
+    for arm, environment in (("a", "Foo-v0"), ("b", "Foo-v0"), ("b", "Bar-v0")):
+        for place in (1, 2):
+            run = tmp_path / arm / f"{environment}_{place}"
+            run.mkdir(parents=True)
+            np.savez(run / "evaluations.npz", timesteps=[10], results=[[5.0]], ep_lengths=[[5]])
+    text = " ".join(part.text[-1] for part in sections(load_results(tmp_path)) if part.name == "comparison")
+    assert "no mean over environments: in some the baseline has no return above zero" in text
+
+
 def test_curves_end_where_a_run_ends_and_show_every_seed(folder: Path) -> None:
     results = load_results(folder)
     curve = learning_curve(results.of(WALKER, MCBS), ACTOR)
@@ -252,7 +262,8 @@ def test_the_page_and_its_files(folder: Path, tmp_path: Path) -> None:
     assert lines[0] == "12 runs, 10 finished" and lines[-1] == f"Report: {tmp_path / 'report.html'}"
     assert "  td3: alone                       4,000 (3,000 to 5,000), 3 runs" in lines
     text = check_page(tmp_path / "report.html")
-    assert "prefers-color-scheme: dark" in text and "sb3-mcbs experiment spec.yml -o two-arms" in text
+    assert "prefers-color-scheme: dark" in text
+    assert "sb3-mcbs experiment two-arms/spec.yml -o two-arms" in text
     assert "The machine and the versions of packages are not recorded" in text
     assert str(folder.parent) not in text
     pictures = {path.stem for path in tmp_path.glob("*.png")}
@@ -311,6 +322,17 @@ def test_logs_of_another_algorithm(tmp_path: Path) -> None:
     names = {path.name for path in (tmp_path / "report").glob("*.svg")}
     assert names == {"final-Hopper-v5.svg", "curves-Hopper-v5-steps.svg", "published-Hopper-v5.svg"}
     assert rows_of(episode_table(load_results(tmp_path / "logs")))["ppo_Hopper-v5_1"]["ended early"] == "50 %"
+
+
+def test_runs_stand_in_the_order_of_their_seeds(tmp_path: Path) -> None:
+    zoo(tmp_path, runs=10)
+    assert [run.folder.name for run in load_results(tmp_path).runs][-1] == "Hopper-v5_10"
+    for run in range(1, 11):
+        place = tmp_path / "ppo" / f"Hopper-v5_{run}" / "Hopper-v5"
+        place.mkdir()
+        (place / "args.yml").write_text(f"{{env: Hopper-v5, seed: {20 - run}}}")
+        (place / "config.yml").write_text("{gamma: 0.9}")
+    assert [run.seed for run in load_results(tmp_path).runs] == list(range(10, 20))
 
 
 def test_runs_of_one_algorithm_with_other_settings_are_other_arms(tmp_path: Path) -> None:
@@ -375,6 +397,16 @@ def test_a_run_that_diverged_does_not_count_as_the_best(tmp_path: Path, value: f
     assert estimate is not None and (estimate.value, estimate.n) == (3.5, 4)
     (problem,) = results.problems
     assert "Pendulum-v1_1" in problem and "not finite numbers, first after 20 steps" in problem
+
+
+@pytest.mark.parametrize("content", ["", "[]", "text", "{name: td3, steps: 3}", "{agent: [1]}"])
+def test_a_run_of_another_version_is_named(tmp_path: Path, content: str) -> None:
+    evaluate(add_run(tmp_path, "td3", CHEETAH, 0), [1.0])
+    other = add_run(tmp_path, "td3", CHEETAH, 1).definition
+    other.write_text(content)
+    results = load_results(tmp_path)
+    assert [run.seed for run in results.runs] == [0]
+    assert len(results.problems) == 1 and f"{other} cannot be read" in results.problems[0]
 
 
 def test_folders_with_nothing_in_them(tmp_path: Path) -> None:

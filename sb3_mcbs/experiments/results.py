@@ -199,11 +199,17 @@ def prepare(folder: Path, spec: Spec, runs: list[Run]) -> list[RunFolder]:
     :param spec: the experiment
     :param runs: its runs
     :return: their folders
-    :raises ResultsError: if the folder has other runs of these names, or further ones
+    :raises ResultsError: if the folder has other runs of these names, or further ones, or cannot be written
     """
-    folder.mkdir(parents=True, exist_ok=True)
     lock = Lock(folder / "lock")
-    if not lock.take(_PATIENCE):  # another runner does the same at this moment
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        is_ours = lock.take(_PATIENCE)
+    except OSError as error:
+        raise ResultsError(
+            f"{folder} cannot be written: {error.strerror}. Name another one with --output."
+        ) from error
+    if not is_ours:  # another runner does the same at this moment
         raise ResultsError(f"{folder} has been locked for long by process {lock.holder()}. End that one.")
     try:
         by_name = {run.name: run for run in runs}

@@ -2,6 +2,7 @@
 
 import argparse
 import csv
+import shlex
 import sys
 from pathlib import Path
 
@@ -76,11 +77,13 @@ def _single(results: Results, output: Path) -> list[str]:
 
 
 def _commands(results: Results, baseline: str | None) -> list[str]:
-    chosen = f" --baseline {baseline}" if baseline else ""
-    first = [f"sb3-mcbs experiment spec.yml -o {results.name}"] if results.spec else []
+    chosen = f" --baseline {shlex.quote(baseline)}" if baseline else ""
+    folder = shlex.quote(results.name)
+    spec = shlex.quote(f"{results.name}/spec.yml")
+    first = [f"sb3-mcbs experiment {spec} -o {folder}"] if results.spec else []
     if not first:
         first = ["# each run by its folder", "sb3-mcbs repeat RUN_FOLDER"]
-    return [*first, f"sb3-mcbs report {results.name}{chosen}"]
+    return [*first, f"sb3-mcbs report {folder}{chosen}"]
 
 
 def _run_records(results: Results) -> list[dict[str, object]]:

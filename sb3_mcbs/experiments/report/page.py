@@ -185,7 +185,7 @@ def _about_comparison(results: Results, by_what: str) -> list[str]:
             f"{unit} as the one with the fewest has, in the order of their seeds; arms that lack one "
             "are left out."
             if by_what
-            else f"There is no mean over {unit}s: some returns are not above zero, where ratios mean nothing."
+            else f"There is no mean over {unit}s: in some the baseline has no return above zero to divide by."
         )
     return text
 

@@ -177,7 +177,7 @@ def _load_experiment(folder: Path, definitions: list[Path]) -> Results:
         place = RunFolder(path.parent)
         try:
             run = place.run()
-        except (OSError, ValueError, TypeError, KeyError, yaml.YAMLError) as error:
+        except (OSError, ValueError, TypeError, KeyError, AttributeError, yaml.YAMLError) as error:
             problems.append(f"{path} cannot be read: {_line(error)}")
             continue
         found.append((run, _experiment_run(place, run, problems)))
@@ -242,7 +242,16 @@ def _tell_apart(runs: list[Result]) -> list[Result]:
         ]
         arm = "-".join([run.arm, *(f"{name}={run.settings[name]}" for name in differing)])
         told.append(replace(run, arm=arm))
-    return sorted(told, key=lambda run: _natural(run.arm))
+    return sorted(
+        told,
+        key=lambda run: (
+            _natural(run.arm),
+            run.task,
+            run.seed is None,
+            run.seed or 0,
+            _natural(run.name),
+        ),
+    )
 
 
 def _zoo_run(path: Path, policies: dict[str, Evaluations], problems: list[str]) -> Result:
