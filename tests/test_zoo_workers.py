@@ -96,6 +96,7 @@ def test_trials_are_pruned_between_seeds(
 def test_interquartile_mean() -> None:
     assert tuning.interquartile_mean(np.array([100.0, 1.0, 3.0, -50.0])) == 2.0
     assert tuning.interquartile_mean(np.array([1.0, 2.0, 9.0])) == 4.0
+    assert np.isnan(tuning.interquartile_mean(np.array([np.nan, 1.0, 3.0, -50.0])))
 
 
 def test_agents_of_the_best_trials_are_kept(tune: Callable[..., optuna.Study], tmp_path: Path) -> None:

@@ -34,9 +34,11 @@ TABLE_ATTEMPTS = 20
 def interquartile_mean(returns: np.ndarray) -> float:
     """
     :param returns: any number of returns
-    :return: their mean without the lowest and the highest quarter (each rounded down)
+    :return: their mean without the lowest and the highest quarter (each rounded down); nan if one is nan
     """
     ordered = np.sort(returns)
+    if np.isnan(ordered[-1]):  # sorted behind all numbers, it would be cut off as if it were the best
+        return float("nan")
     cut = len(ordered) // 4
     return float(ordered[cut : len(ordered) - cut].mean())
 
