@@ -175,6 +175,7 @@ def test_a_run_that_was_first_evaluated_later_is_not_compared(tmp_path: Path) ->
     results = load_results(tmp_path)
     assert finals(results, "Pendulum-v1", Competitor("ppo", ACTOR)) == [110, 208]
     assert list(rows_of(episode_table(results))) == ["ppo_Pendulum-v1_1", "ppo_Pendulum-v1_2"]
+    assert "No curve of ppo: alone in Pendulum-v1" in " ".join(sections(results)[1].text)
     text = " ".join(sections(results)[0].text)
     assert "Some runs in Pendulum-v1 were not evaluated at that step, but before" in text
     assert "Not compared in Pendulum-v1, since first evaluated later: ppo_Pendulum-v1_3." in text
@@ -204,6 +205,13 @@ def test_curves_end_where_a_run_ends_and_show_every_seed(folder: Path) -> None:
     assert simulated["mcbs_td3: alone, steps of the environment and of the search"] == "3,300"
     time = rows_of(pictures[f"curves-{CHEETAH}-time"].table)["300"]
     assert time["td3: alone, hours of training"] == "3"
+
+
+def test_markers_do_not_hide_a_long_curve(tmp_path: Path) -> None:
+    run = zoo(tmp_path, runs=1) / "ppo" / "Hopper-v5_1"
+    np.savez(run / "evaluations.npz", timesteps=np.arange(1, 3001), results=np.zeros((3000, 1)))
+    (picture,) = curve_pictures(load_results(tmp_path), "Hopper-v5")
+    assert 20 < picture.drawing.svg.count("<use") < 60
 
 
 def test_tables_of_runs(folder: Path) -> None:
@@ -244,6 +252,7 @@ def test_a_grid_around_a_trained_agent(tmp_path: Path) -> None:
         "18": {"B": "18", "D = 1": "181, 1 run", "D = 3": "183, 1 run"},
     }
     assert rows_of(paper.table)["1"]["D = 6"] == "–"
+    assert not any("improvement" in line for part in sections(results) for line in part.text)
     lines = report(tmp_path / "frozen", tmp_path / "out")
     assert lines[:2] == ["5 runs, 5 finished", "sac:"] and "actor" in lines[2]
     text = check_page(tmp_path / "out" / "report.html")

@@ -19,6 +19,8 @@ MUTED = "#6a737d"
 #: Of the background, where something has to stand out from what lies below it.
 GROUND = "#fdfdfe"
 WIDTH = 5.2
+#: Of a curve: more would hide it.
+MAX_MARKERS = 25
 _STYLE: Any = {
     "font.size": 10.5, "svg.fonttype": "none", "svg.hashsalt": "sb3-mcbs", "figure.facecolor": GROUND,
     "axes.facecolor": "none", "axes.edgecolor": MUTED, "axes.labelcolor": INK, "text.color": INK,
@@ -170,7 +172,8 @@ def draw_curves(
                 axes.fill_between(
                     line.x, line.low, line.high, color=line.look.colour, alpha=0.15, linewidth=0
                 )
-            axes.plot(line.x, line.centre, linewidth=2, **line.look.line)
+            every = -(-len(line.x) // MAX_MARKERS)
+            axes.plot(line.x, line.centre, linewidth=2, markevery=every, **line.look.line)
         if log:
             axes.set_xscale("log")
         for _, x, y in published:

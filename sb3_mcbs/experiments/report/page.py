@@ -14,7 +14,7 @@ from sb3_mcbs.experiments.report.curves import curve_pictures, simulates
 from sb3_mcbs.experiments.report.drawing import COLOURS
 from sb3_mcbs.experiments.report.references import published_curves, sources
 from sb3_mcbs.experiments.report.runs import Results, at, short
-from sb3_mcbs.experiments.report.statistics import MIN_SEEDS, common_step, final_estimate
+from sb3_mcbs.experiments.report.statistics import MIN_SEEDS, common_step, common_steps, final_estimate
 from sb3_mcbs.experiments.report.tables import episode_table, machine_table, run_table, speed_table
 from sb3_mcbs.experiments.results import FINISHED
 from sb3_mcbs.zoo.evaluations import SEARCH
@@ -57,7 +57,9 @@ def sections(results: Results) -> list[Section]:
         scales, by_what = _scales(results)
         pictures = overall_pictures(results, scales, by_what)
         if pictures:
-            found.append(Section("comparison", "Comparison", _about_comparison(results, by_what), pictures))
+            found.append(
+                Section("comparison", "Comparison", _about_comparison(results, by_what, pictures), pictures)
+            )
     if not results.frozen:
         curves = [picture for task in results.tasks for picture in curve_pictures(results, task)]
         found.append(Section("curves", "Learning curves", _about_curves(results), curves))
@@ -171,14 +173,16 @@ def _about_returns(results: Results) -> list[str]:
     return text
 
 
-def _about_comparison(results: Results, by_what: str) -> list[str]:
+def _about_comparison(results: Results, by_what: str, pictures: list[Picture]) -> list[str]:
     unit = results.unit
-    text = [
-        f"The baseline is {short(results.competitors[0].arm)}. Probability of improvement: how often a run "
-        "of the arm returns more than a run of the baseline with the same policy, or with its only one. "
-        "Above 0.5 the arm is better; where the interval contains 0.5, chance may explain it. Where all "
-        "resamples agree there is no interval: so few runs cannot say how sure that is."
-    ]
+    text = [f"The baseline is {short(results.competitors[0].arm)}."]
+    if any(picture.name.startswith("improvement") for picture in pictures):
+        text[0] += (
+            " Probability of improvement: how often a run of the arm returns more than a run of the baseline "
+            "with the same policy, or with its only one. Above 0.5 the arm is better; where the interval "
+            "contains 0.5, chance may explain it. Where all resamples agree there is no interval: so few "
+            "runs cannot say how sure that is."
+        )
     if len(results.tasks) > 1:
         text.append(
             f"For means over {unit}s returns are divided by {by_what}. They take as many runs of each "
@@ -204,6 +208,12 @@ def _about_curves(results: Results) -> list[str]:
             f"In {', '.join(nowhere)} no training simulated steps besides those of the environment, or "
             "nobody recorded them: there are no curves over simulated steps."
         )
+    text += [
+        f"No curve of {each.label} in {task}: its runs were never evaluated at the same step."
+        for task in results.tasks
+        for each in results.competitors
+        if results.of(task, each) and not common_steps(results.of(task, each), each.policy)
+    ]
     if not any(each.policy == SEARCH for each in results.competitors):
         text.append("No run was evaluated with search.")
     return text
@@ -213,7 +223,8 @@ def _about_speed() -> list[str]:
     return [
         "90 %: the first evaluation that reaches 90 % of the run's own best mean return, where that is "
         "above zero. Baseline: the first that reaches the mean return of the baseline in the first "
-        "section, with the same policy if it has it. A dash: it never did, or nobody recorded it."
+        "section, with the same policy if it has it. A dash: it never did, or nobody recorded it. Steps of "
+        "the search and hours are those of training: evaluations do not count."
     ]
 
 

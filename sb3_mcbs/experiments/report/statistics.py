@@ -150,16 +150,25 @@ def _seeded() -> Iterator[None]:
         np.random.set_state(state)
 
 
+def common_steps(runs: list[Result], policy: str) -> list[int]:
+    """
+    :param runs: of one arm in one task
+    :param policy: that was evaluated
+    :return: the steps at which every run was
+    """
+    return sorted(set.intersection(*(set(run.policies[policy].timesteps.tolist()) for run in runs)))
+
+
 def learning_curve(runs: list[Result], policy: str) -> Curve | None:
     """
     :param runs: of one arm in one task
     :param policy: of which the returns are
     :return: over the steps at which every run was evaluated; None: there are no such steps
     """
-    evaluations = [run.policies[policy] for run in runs]
-    steps = sorted(set.intersection(*(set(each.timesteps.tolist()) for each in evaluations)))
+    steps = common_steps(runs, policy)
     if not steps:
         return None
+    evaluations = [run.policies[policy] for run in runs]
     indices = [np.searchsorted(each.timesteps, steps) for each in evaluations]
     scores = np.stack([each.means[index] for each, index in zip(evaluations, indices, strict=True)])[:, None]
     low = high = None
