@@ -1,5 +1,7 @@
 """Folders of runs with known numbers, to be reported on."""
 
+import html.parser
+import re
 from pathlib import Path
 from typing import Any
 
@@ -7,6 +9,7 @@ import numpy as np
 
 from sb3_mcbs.experiments.evaluation import write_evaluations
 from sb3_mcbs.experiments.plan import Run
+from sb3_mcbs.experiments.report.content import Table
 from sb3_mcbs.experiments.results import FINISHED, RunFolder
 from sb3_mcbs.experiments.spec import Agent, Evaluation
 from sb3_mcbs.zoo.paths import sibling_folder
@@ -108,3 +111,46 @@ def zoo(folder: Path, algorithm: str = "ppo", runs: int = 2) -> Path:
         )
         (run / "Hopper-v5.zip").touch()
     return folder
+
+
+class Page(html.parser.HTMLParser):
+    """Checks that elements are closed in order, and collects what a page refers to."""
+
+    VOID = ("meta", "br", "link", "img", "hr", "input")
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.attributes: list[tuple[str, str, str]] = []
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.attributes += [(tag, name, value or "") for name, value in attrs]
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.attributes += [(tag, name, value or "") for name, value in attrs]
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open and self.open.pop() == tag, f"</{tag}> in {self.open[-3:]}"
+
+
+def check_page(path: Path) -> str:
+    """The text of a page that is well-formed and complete in itself."""
+    text = path.read_text(encoding="utf-8")
+    page = Page(text)
+    assert not page.open
+    ids = [value for _, name, value in page.attributes if name == "id"]
+    assert len(ids) == len(set(ids))
+    links = [value for _, name, value in page.attributes if name in ("href", "src", "xlink:href")]
+    assert links and all(link.startswith("#") and link[1:] in ids for link in links)
+    assert set(re.findall(r"url\(#([^)]*)\)", text)) <= set(ids) and "url(http" not in text
+    assert "@import" not in text and "<script" not in text
+    assert text.count("<figure>") == text.count('role="img"') == text.count("<summary>Numbers")
+    return text
+
+
+def rows_of(table: Table) -> dict[str, dict[str, str]]:
+    return {row[0]: dict(zip(table.head, row, strict=True)) for row in table.rows}

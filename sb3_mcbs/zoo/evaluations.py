@@ -59,7 +59,10 @@ def load_evaluations(folder: str | Path) -> Evaluations:
             f"There is no folder {folder}. Name that of a run, for example logs/mcbs_td3/HalfCheetah-v5_1."
         )
     if not path.is_file():
-        raise PathError(f"{path} does not exist: train with --eval-freq smaller than the run's steps.")
+        raise PathError(
+            f"{path} does not exist. Name the folder of a run, RL Zoo's log folder or that of an experiment; "
+            "train with --eval-freq smaller than the run's steps."
+        )
     try:
         with np.load(path) as data:
             arrays = {name: np.asarray(data[key]) for key, (name, _) in _ARRAYS.items() if key in data}
