@@ -19,7 +19,7 @@ from sb3_mcbs.experiments.engine import LOSSES, Engine
 from sb3_mcbs.experiments.process import Lost
 from sb3_mcbs.experiments.results import RunFolder, prepare
 from sb3_mcbs.experiments.transfer import Packer, unpack
-from sb3_mcbs.experiments.worker import Order, _make_folder, describe, refusal
+from sb3_mcbs.experiments.worker import Order, _make_folder, describe, refusal, refusal_of_scratch
 from tests.experiment_helpers import SPEC, TD3, spec_file
 
 
@@ -191,6 +191,10 @@ def test_a_node_that_is_not_like_the_runners_is_refused(tmp_path: Path) -> None:
     text = refusal(other, None)
     assert text.startswith("it has torch ") and ", the runner torch 1.0. Install" in text
     assert "does not see the results" in refusal(describe(), tmp_path / "nothing")
+    scratch = tmp_path / "token" / "scratch"
+    assert refusal_of_scratch(tmp_path / "new") == refusal_of_scratch(None) == ""
+    text = refusal_of_scratch(scratch)
+    assert text == f"it cannot write in {scratch} (Not a directory). Choose another --scratch folder"
     assert "sources" in str(describe()["sb3-mcbs"])
 
 

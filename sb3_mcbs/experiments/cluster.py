@@ -56,7 +56,11 @@ def _make_seat() -> type:
         """A place on a node for one run."""
 
         def admit(
-            self, expected: dict[str, str | None], token: Path | None, added_paths: list[str]
+            self,
+            expected: dict[str, str | None],
+            token: Path | None,
+            scratch: Path | None,
+            added_paths: list[str],
         ) -> tuple[str, ...]:
             """Say which node this is, and whether it may train."""
             import ray
@@ -72,7 +76,9 @@ def _make_seat() -> type:
                 reason = f"sb3-mcbs cannot be imported there ({error}). Install it on all nodes"
                 return (*node, reason, "")
             self._worker = worker.Worker()
-            return (*node, worker.refusal(expected, token), self._worker.processor)
+            # First that of nodes with another version, which may not have the second.
+            reason = worker.refusal(expected, token) or worker.refusal_of_scratch(scratch)
+            return (*node, reason, self._worker.processor)
 
         def tell(self, method: str, *arguments: Any) -> Any:
             """Call a method of the worker."""
@@ -135,7 +141,8 @@ class RayRun:
 
     def _take_place(self) -> None:
         self._seat = self._cluster.new_seat()
-        self._answer = self._seat.admit.remote(describe(), self._cluster.token, _added_paths())
+        cluster = self._cluster
+        self._answer = self._seat.admit.remote(describe(), cluster.token, cluster.scratch, _added_paths())
         self._on_answer = self._on_admission
 
     def _ask(self, on_answer: Callable[[Any], None], method: str, *arguments: Any) -> None:
@@ -193,8 +200,8 @@ class Cluster:
         self, say: Callable[[str], None], token: Path | None, scratch: Path | None, gpus_per_run: float
     ) -> None:
         self.token = token
+        self.scratch = scratch
         self._say = say
-        self._scratch = scratch
         self._gpus_per_run = gpus_per_run
         self._refused: dict[str, Node] = {}
 
@@ -242,12 +249,12 @@ class Cluster:
         # Ray hides GPUs from those who ask for none, but not in every version.
         environment = {} if self._gpus_per_run else {"CUDA_VISIBLE_DEVICES": ""}
         parcel, agent_files = Parcel(), {}
-        if self._scratch is not None:
+        if self.scratch is not None:
             parcel, agent = Packer(folder).pack(), folder.run().agent
             if agent is not None:
                 named = {"file": agent.file, "statistics": agent.statistics}
                 agent_files = {name: Path(path).read_bytes() for name, path in named.items() if path}
-        return Order(folder.path, self._scratch, parcel, agent_files, environment)
+        return Order(folder.path, self.scratch, parcel, agent_files, environment)
 
     def warn_of_missing(self) -> None:
         """Say so if no node has what a run needs."""

@@ -89,6 +89,23 @@ def refusal(expected: dict[str, str | None], token: Path | None) -> str:
     return ""
 
 
+def refusal_of_scratch(scratch: Path | None) -> str:
+    """
+    Check whether this node can write where runs are trained.
+
+    :param scratch: a folder; None: the runs' folders
+    :return: why not, and what to do; nothing if it can
+    """
+    if scratch is not None:
+        try:
+            scratch.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=scratch) as file:
+                file.write(b"something, which a full disk does not take")
+        except OSError as error:
+            return f"it cannot write in {scratch} ({error.strerror}). Choose another --scratch folder"
+    return ""
+
+
 class Worker:
     """
     Trains one run on this node.
