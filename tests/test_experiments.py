@@ -133,6 +133,14 @@ def test_another_spec_is_refused(changes: dict, message: str, tmp_path: Path) ->
     assert (tmp_path / "results" / "spec.yml").read_text() == spec.text
 
 
+def test_a_broken_definition_of_a_run_is_named(tmp_path: Path) -> None:
+    spec = read_spec(spec_file(tmp_path))
+    folder = prepare(tmp_path / "results", spec, expand(spec))[0]
+    folder.definition.write_text("a: [")
+    with pytest.raises(ResultsError, match=r"run.yml cannot be read. Remove .* to begin this run again"):
+        prepare(tmp_path / "results", spec, expand(spec))
+
+
 def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").touch()
     for place in ("file", "file/results"):

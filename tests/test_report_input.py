@@ -99,6 +99,16 @@ def test_a_run_of_another_version_is_named(tmp_path: Path, content: str) -> None
     assert len(results.problems) == 1 and f"{other} cannot be read" in results.problems[0]
 
 
+def test_broken_files_of_an_experiment_do_not_end_the_report(tmp_path: Path) -> None:
+    place = add_run(tmp_path, "td3", CHEETAH, 0)
+    evaluate(place, [1.0])
+    (tmp_path / "spec.yml").write_bytes(b"# \xff")
+    (place.path / "status.json").write_text("[1]")
+    (place.path / "machines.json").write_text("[1]")
+    (run,) = load_results(tmp_path).runs
+    assert (run.state, run.machines) == ("not started", [])
+
+
 def test_folders_with_nothing_in_them(tmp_path: Path) -> None:
     add_run(tmp_path / "planned", "td3", CHEETAH, 0)
     with pytest.raises(PathError, match=r"nothing to report in .*planned. Its runs have not come to an"):

@@ -217,7 +217,12 @@ def prepare(folder: Path, spec: Spec, runs: list[Run]) -> list[RunFolder]:
             name = path.parent.name
             if name not in by_name:
                 raise ResultsError(_other_spec(folder, f"it has the run {name}, which the spec does not"))
-            difference = _difference(path, by_name[name])
+            try:
+                difference = _difference(path, by_name[name])
+            except (ValueError, yaml.YAMLError) as error:
+                raise ResultsError(
+                    f"{path} cannot be read. Remove {path.parent} to begin this run again."
+                ) from error
             if difference:
                 raise ResultsError(_other_spec(folder, f"{name}: {difference}"))
         folders = []
@@ -243,7 +248,7 @@ def write(path: Path, content: str | bytes) -> None:
 def _read_json(path: Path) -> dict[str, Any]:
     try:
         return dict(json.loads(path.read_text()))
-    except (OSError, ValueError):
+    except (OSError, ValueError, TypeError):
         return {}
 
 

@@ -170,7 +170,7 @@ def load_results(folder: Path, baseline: str | None = None) -> Results:
 
 def _load_experiment(folder: Path, definitions: list[Path]) -> Results:
     spec = folder / "spec.yml"
-    text = spec.read_text() if spec.is_file() else None
+    text = spec.read_text(encoding="utf-8", errors="replace") if spec.is_file() else None
     problems: list[str] = []
     found = []
     for path in definitions:
