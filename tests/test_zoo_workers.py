@@ -168,6 +168,8 @@ def test_workers_agree_on_the_objective(tune: Callable[..., optuna.Study]) -> No
     tune("--n-trials", "1")
     with pytest.raises(SystemExit, match="study tiny has --trial-seeds 1, not 2"):
         tune("--n-trials", "1", "--trial-seeds", "2")
+    with pytest.raises(SystemExit, match="study tiny has --heartbeat 60, not 0"):
+        tune("--n-trials", "1", "--heartbeat", "0")
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 import optuna
+from optuna.storages import RDBStorage
 from rl_zoo3.exp_manager import ExperimentManager
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -204,7 +205,12 @@ class MCBSExperimentManager(ExperimentManager):
             opened: Any = open_storage(self.storage, self.heartbeat)
             self.storage = opened
             if self.study_name is not None:
-                settings = {"trial-seeds": self.trial_seeds, "trial-objective": self.trial_objective}
+                beats = self.heartbeat if isinstance(opened, RDBStorage) else 0
+                settings = {
+                    "trial-seeds": self.trial_seeds,
+                    "trial-objective": self.trial_objective,
+                    "heartbeat": beats,  # a worker would wait forever for the trial of a dead one without
+                }
                 join_study(opened, self.study_name, settings)
         super().hyperparameters_optimization()
         self._delete_agents()

@@ -197,8 +197,8 @@ def join_study(storage: BaseStorage, name: str, settings: dict[str, Any]) -> Non
             study.set_user_attr(option, value)
         elif known != value:
             sys.exit(
-                f"The study {name} has --{option} {known}, not {value}: values of its trials could not be "
-                "compared. Use the same, or another --study-name."
+                f"The study {name} has --{option} {known}, not {value}. All its workers need the same: "
+                "join it with that, or use another --study-name."
             )
     _free_lost_trials(study)
 

@@ -43,7 +43,7 @@ def final_picture(results: Results, task: str) -> Picture:
         if estimate is not None:
             name = name_of(results, competitor)
             rows.append(Row(row_label(name), look[competitor], values, estimate))
-            spread = number(float(np.std(values))) if len(values) > 1 else "–"
+            spread = number(float(np.std(values, ddof=1))) if len(values) > 1 else "–"
             cells.append(
                 [name, estimate_text(estimate), number(float(np.mean(values))), spread, str(len(values))]
             )
@@ -161,7 +161,7 @@ def heat_pictures(results: Results) -> list[Picture]:
     :param results: of a folder
     :return: returns by beam width and rollout depth, where arms differ in both, and the paper's
     """
-    groups: dict[tuple[str, Competitor], dict[tuple[int, int], Estimate]] = {}
+    groups: dict[tuple[str, str, Competitor], dict[tuple[int, int], Estimate]] = {}
     for task in results.tasks:
         for competitor in results.competitors:
             for run in results.of(task, competitor)[:1]:
@@ -171,11 +171,10 @@ def heat_pictures(results: Results) -> list[Picture]:
                 if None not in cell and estimate is not None:
                     arm = competitor.arm.split("-beam_width=")[0].split("-rollout_depth=")[0]
                     rest = json.dumps(settings, sort_keys=True, default=str)
-                    groups.setdefault((task + rest, Competitor(arm, competitor.policy)), {})[cell] = estimate
+                    groups.setdefault((task, rest, Competitor(arm, competitor.policy)), {})[cell] = estimate
     pictures = []
     names: dict[str, Any] = {}
-    for (key, competitor), cells in groups.items():
-        task = next(task for task in results.tasks if key.startswith(task + "{"))
+    for (task, _, competitor), cells in groups.items():
         if len({width for width, _ in cells}) > 1 or len({depth for _, depth in cells}) > 1:
             title = f"{task}: {name_of(results, competitor)}"
             name = f"beam-{slug(title)}"
@@ -184,7 +183,8 @@ def heat_pictures(results: Results) -> list[Picture]:
             pictures.append(
                 _heat(name + suffix, title, {cell: (each.value, each.n) for cell, each in cells.items()})
             )
-    if pictures:
+    shown = {run.environment for task in results.tasks for run in results.of(task)}
+    if pictures and any(environment.startswith("HalfCheetah") for environment in shown):
         paper = paper_beam()
         pictures.append(
             _heat("beam-paper", "The paper's Table II: HalfCheetah-v4, MCBS-TD3, 1M steps", paper)
