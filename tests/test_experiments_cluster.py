@@ -12,14 +12,14 @@ from rich.console import Console
 
 from sb3_mcbs.checkpoints.encoding import Encoded
 from sb3_mcbs.checkpoints.store import Store
-from sb3_mcbs.experiments import command, expand, read_spec, transfer
+from sb3_mcbs.experiments import cluster, command, expand, read_spec, transfer
 from sb3_mcbs.experiments.cluster import Cluster
 from sb3_mcbs.experiments.display import Display
 from sb3_mcbs.experiments.engine import LOSSES, Engine
 from sb3_mcbs.experiments.process import Lost
 from sb3_mcbs.experiments.results import RunFolder, prepare
 from sb3_mcbs.experiments.transfer import Packer, unpack
-from sb3_mcbs.experiments.worker import Order, _make_folder, describe, refusal, refusal_of_scratch
+from sb3_mcbs.experiments.worker import Order, Report, _make_folder, describe, refusal, refusal_of_scratch
 from tests.experiment_helpers import SPEC, TD3, spec_file
 
 
@@ -245,6 +245,19 @@ def test_a_lost_node_is_no_crash_but_not_without_end(tmp_path: Path, monkeypatch
 def test_losses_count_from_the_last_new_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     _, text, n_launched = lose(tmp_path, monkeypatch, 3)
     assert n_launched == 3 + LOSSES - 1 and f" {TD3}: goes on, node somewhere" in text
+
+
+def test_results_that_cannot_be_stored_are_a_loss(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(cluster, "unpack", fail)
+    monkeypatch.setattr(cluster.RayRun, "_take_place", lambda run: None)
+    monkeypatch.setattr(cluster.RayRun, "_leave_place", lambda run: None)
+    folder = run_folder(tmp_path)
+    run = cluster.RayRun(Cluster(print, None, None, 0.0), folder)
+    run._on_report(Report(parcel=Packer(folder).pack()))
+    assert run.poll() == Lost("its results cannot be stored here: no space left on device")
 
 
 @pytest.mark.parametrize(

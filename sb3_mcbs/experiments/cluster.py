@@ -165,10 +165,14 @@ class RayRun:
         if report.taken_by:
             self._end(Lost(f"another runner has taken it: {report.taken_by}"))
             return
-        if report.progress:
-            write(self._folder.progress_file, json.dumps(report.progress) + "\n")
-        if report.parcel is not None:
-            unpack(report.parcel, self._folder)
+        try:
+            if report.progress:
+                write(self._folder.progress_file, json.dumps(report.progress) + "\n")
+            if report.parcel is not None:
+                unpack(report.parcel, self._folder)
+        except OSError as error:  # a full disk, perhaps: the others must not end with a traceback
+            self._end(Lost(f"its results cannot be stored here: {error}"))
+            return
         if report.status is not None:
             self._end(report.status)
         self._next_look = time.monotonic() + _LOOK_EVERY
