@@ -118,7 +118,7 @@ SHIPPED = {
     "smoke": 2,
     "short": 18,
     "paper": 75,
-    "evidence": 27,
+    "evidence": 45,
     "ablation": 18,
     "ablation-frozen": 66,
     "search-training": 55,
