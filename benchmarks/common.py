@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import os
 import platform
 import time
 from collections.abc import Callable, Sequence
@@ -11,6 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from sb3_mcbs.experiments.machine import processor_name
+from sb3_mcbs.models.mujoco_batch import usable_cores
 
 #: The results in the repository.
 COMMITTED = Path(__file__).parent / "results"
@@ -21,14 +23,10 @@ NETWORKS = {"net_arch": [400, 300]}
 
 def machine() -> dict[str, str]:
     """Describe where this runs."""
-    processor = platform.processor() or platform.machine()
-    if Path("/proc/cpuinfo").exists():
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        processor = next((line.split(":")[1].strip() for line in lines if "model name" in line), processor)
     packages = ("torch", "mujoco", "gymnasium", "stable-baselines3", "numpy")
     return {
-        "processor": processor,
-        "cores": str(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()),
+        "processor": processor_name() or platform.machine(),
+        "cores": str(usable_cores()),
         "Python": platform.python_version(),
         **{name: version(name) for name in packages},
     }

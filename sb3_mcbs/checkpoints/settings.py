@@ -34,6 +34,8 @@ from sb3_mcbs.checkpoints.handlers import HANDLERS, handler_of
 from sb3_mcbs.snapshot import SnapshotEnvWrapper, SnapshotUnsupportedError
 from sb3_mcbs.snapshot.object_graph import Capture, Restore
 
+#: On whose versions it depends what a run computes.
+_PACKAGES = ("numpy", "torch", "gymnasium", "stable-baselines3", "sb3-contrib", "mujoco", "sb3-mcbs")
 #: Parameters of constructors that are kept under another name.
 _ATTRIBUTES = {"policy": "policy_class", "stats_window_size": "_stats_window_size"}
 _NOT_SETTINGS = ("self", "env", "_init_setup_model")
@@ -251,9 +253,11 @@ def processor() -> str:
     return f"{platform.machine()} {th.backends.cpu.get_cpu_capability()}"
 
 
-def versions() -> dict[str, str | None]:
-    """Return the versions on which it depends what a run computes."""
-    packages = ("numpy", "torch", "gymnasium", "stable-baselines3", "sb3-contrib", "mujoco", "sb3-mcbs")
+def versions(packages: Iterable[str] = _PACKAGES) -> dict[str, str | None]:
+    """Return versions of Python and of packages.
+
+    :param packages: by default those on which it depends what a run computes.
+    """
     return {"python": platform.python_version(), **{package: _version(package) for package in packages}}
 
 

@@ -2,9 +2,10 @@
 
 import os
 import platform
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
+
+from sb3_mcbs.checkpoints.settings import versions
 
 PACKAGES = (
     "sb3-mcbs",
@@ -24,25 +25,19 @@ def describe_machine() -> dict[str, Any]:
     """
     return {
         "system": f"{platform.system()} {platform.machine()}",
-        "processor": _processor(),
+        "processor": processor_name() or "unknown",
         "cores": os.cpu_count(),
-        "python": platform.python_version(),
-        **{package: _version(package) for package in PACKAGES},
+        **versions(PACKAGES),
     }
 
 
-def _processor() -> str:
-    """Its name; Python's own function knows it on few systems."""
+def processor_name() -> str:
+    """
+    :return: its name, which Python's own function knows on few systems; nothing if nobody knows it
+    """
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
         lines = []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or "unknown"
-
-
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
+    return names[0] if names else platform.processor()

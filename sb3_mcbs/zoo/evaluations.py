@@ -39,10 +39,33 @@ class Evaluations:
     simulated_steps: np.ndarray | None = None
     seconds: np.ndarray | None = None
 
+    def costs(self, index: int) -> dict[str, float | None]:
+        """
+        :param index: of an evaluation
+        :return: ``timesteps``, ``simulated_steps`` and ``seconds`` until then; None: not recorded
+        """
+        return {
+            "timesteps": int(self.timesteps[index]),
+            "simulated_steps": None if self.simulated_steps is None else int(self.simulated_steps[index]),
+            "seconds": None if self.seconds is None else float(self.seconds[index]),
+        }
+
     @property
     def means(self) -> np.ndarray:
         """Mean return of each evaluation."""
         return self.returns.mean(axis=1)
+
+
+def interquartile_mean(returns: np.ndarray) -> np.ndarray:
+    """
+    :param returns: ``[n, ...]``, any number of returns
+    :return: ``[...]``, their mean without the lowest and the highest quarter (each rounded down); nan where
+        one is nan
+    """
+    ordered = np.sort(returns, axis=0)
+    cut = len(ordered) // 4
+    # A nan is sorted behind all numbers, and would be cut off as if it were the best.
+    return np.where(np.isnan(ordered[-1]), np.nan, ordered[cut : len(ordered) - cut].mean(axis=0))
 
 
 def load_evaluations(folder: str | Path) -> Evaluations:

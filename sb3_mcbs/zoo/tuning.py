@@ -18,6 +18,8 @@ from optuna.storages.journal import JournalFileBackend
 from optuna.study import MaxTrialsCallback
 from optuna.trial import FrozenTrial, TrialState
 
+from sb3_mcbs.zoo.evaluations import interquartile_mean
+
 #: Names of the user attributes of trials.
 RETURNS, SEEDS, OBJECTIVE, FOLDER = "returns", "seeds", "objective", "folder"
 #: Seconds between two signs of life of a worker. A trial without one for twice as long has lost its worker.
@@ -31,23 +33,11 @@ PROXY = "grpc://"
 TABLE_ATTEMPTS = 20
 
 
-def interquartile_mean(returns: np.ndarray) -> float:
-    """
-    :param returns: any number of returns
-    :return: their mean without the lowest and the highest quarter (each rounded down); nan if one is nan
-    """
-    ordered = np.sort(returns)
-    if np.isnan(ordered[-1]):  # sorted behind all numbers, it would be cut off as if it were the best
-        return float("nan")
-    cut = len(ordered) // 4
-    return float(ordered[cut : len(ordered) - cut].mean())
-
-
-def _mean(returns: np.ndarray) -> float:
-    return float(np.mean(returns))
-
-
-OBJECTIVES: dict[str, Callable[[np.ndarray], float]] = {"mean": _mean, "iqm": interquartile_mean}
+#: From the returns of episodes, what a trial is judged by.
+OBJECTIVES: dict[str, Callable[[np.ndarray], float]] = {
+    "mean": lambda returns: float(np.mean(returns)),
+    "iqm": lambda returns: float(interquartile_mean(returns)),
+}
 
 
 def _at_least(least: int) -> Callable[[str], int]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from sb3_mcbs.experiments.report.page import render, sections, summary
 from sb3_mcbs.experiments.report.runs import Results, load_results
 from sb3_mcbs.experiments.report.statistics import MissingPackageError, falls, first_near_best, import_rliable
-from sb3_mcbs.zoo.evaluations import Evaluations, newest_run
+from sb3_mcbs.zoo.evaluations import newest_run
 
 
 def main() -> None:
@@ -94,7 +94,7 @@ def _run_records(results: Results) -> list[dict[str, object]]:
         for policy, each in run.policies.items():
             label = policy.replace(" ", "_")
             near = first_near_best(each)
-            record |= _costs(each, -1)
+            record |= each.costs(-1)
             record[f"{label}_return"] = float(each.means[-1])
             record[f"{label}_90_percent_timesteps"] = None if near is None else int(each.timesteps[near])
             record[f"{label}_mean_length"] = None if each.lengths is None else float(each.lengths[-1].mean())
@@ -103,20 +103,12 @@ def _run_records(results: Results) -> list[dict[str, object]]:
     return records
 
 
-def _costs(each: Evaluations, index: int) -> dict[str, object]:
-    return {
-        "timesteps": int(each.timesteps[index]),
-        "simulated_steps": None if each.simulated_steps is None else int(each.simulated_steps[index]),
-        "seconds": None if each.seconds is None else float(each.seconds[index]),
-    }
-
-
 def _evaluation_records(results: Results) -> list[dict[str, object]]:
     records: list[dict[str, object]] = []
     for run in results.evaluated:
         for policy, each in run.policies.items():
             for index in range(len(each.timesteps)):
-                record: dict[str, object] = {"run": run.name, "policy": policy, **_costs(each, index)}
+                record: dict[str, object] = {"run": run.name, "policy": policy, **each.costs(index)}
                 record["mean_return"] = float(each.means[index])
                 for episode, value in enumerate(each.returns[index]):
                     record[f"return_{episode}"] = float(value)

@@ -187,12 +187,12 @@ def _beside_published(results: Results, task: str, curves: Curves) -> Picture | 
     lines = [
         Line(look[each], curve.steps, curve.centre, None, None, []) for each, (curve, _) in curves.items()
     ]
-    own = [
-        [name_of(results, each), *_at(curve.steps, curve.centre, published)]
+    steps = sorted({int(step) for _, steps, _ in published for step in steps})
+    rows = [
+        [name_of(results, each), *_at(curve.steps, curve.centre, steps)]
         for each, (curve, _) in curves.items()
     ]
-    steps = sorted({int(step) for _, steps, _ in published for step in steps})
-    rows = own + [[name, *_at(x, y, published)] for name, x, y in published]
+    rows += [[name, *_at(x, y, steps)] for name, x, y in published]
     best = max(published, key=lambda each: each[2][-1])
     return Picture(
         name=f"published-{slug(task)}",
@@ -208,7 +208,6 @@ def _beside_published(results: Results, task: str, curves: Curves) -> Picture | 
     )
 
 
-def _at(x: np.ndarray, y: np.ndarray, published: Sequence[tuple[str, np.ndarray, np.ndarray]]) -> list[str]:
+def _at(x: np.ndarray, y: np.ndarray, steps: Sequence[int]) -> list[str]:
     known = dict(zip(x.tolist(), y.tolist(), strict=True))
-    steps = sorted({int(step) for _, steps, _ in published for step in steps})
     return [number(known.get(step)) for step in steps]

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sb3_mcbs.experiments.report.runs import Competitor, Result, Results, at
+from sb3_mcbs.zoo.evaluations import interquartile_mean
 
 #: With fewer seeds there is no interval: it would pretend to know more than anybody does.
 MIN_SEEDS = 3
@@ -98,9 +99,7 @@ def _single(values: tuple[float, ...]) -> Estimate:
 
 def _iqm(scores: np.ndarray) -> np.ndarray:
     """As rliable's ``aggregate_iqm`` of ``[runs, tasks, n]``, for each of the n at once."""
-    ordered = np.sort(scores.reshape(-1, scores.shape[2]), axis=0)
-    cut = len(ordered) // 4
-    return ordered[cut : len(ordered) - cut].mean(axis=0)
+    return interquartile_mean(scores.reshape(-1, scores.shape[2]))
 
 
 def _estimate(scores: list[np.ndarray], statistic: Callable[..., Any]) -> Estimate:

@@ -17,12 +17,8 @@ def _cost(evaluations: Evaluations, index: int | None) -> list[str]:
     """Environment steps, steps of the search and hours until an evaluation."""
     if index is None:
         return ["–"] * 3
-    simulated, seconds = evaluations.simulated_steps, evaluations.seconds
-    return [
-        number(float(evaluations.timesteps[index])),
-        "–" if simulated is None else number(float(simulated[index])),
-        "–" if seconds is None else number(float(seconds[index]) / 3600),
-    ]
+    timesteps, simulated, seconds = evaluations.costs(index).values()
+    return [number(timesteps), number(simulated), number(None if seconds is None else seconds / 3600)]
 
 
 def speed_table(results: Results) -> Table:
