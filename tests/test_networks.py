@@ -11,7 +11,8 @@ from sb3_contrib.common.torch_layers import BatchRenorm1d
 from stable_baselines3 import DDPG, SAC, TD3
 from stable_baselines3.common.env_util import make_vec_env
 
-from sb3_mcbs import MCBSTD3
+from sb3_mcbs import MCBSTD3, MCBSCrossQ
+from sb3_mcbs.networks.batch_renorm import FusedBatchRenorm1d, fuse_batch_renorm
 from sb3_mcbs.networks.functions import policy_function, value_function
 from sb3_mcbs.networks.mlp import MLP
 from sb3_mcbs.networks.plain_networks import actor_mlp, critic_mlps
@@ -120,6 +121,54 @@ def test_batch_renormalization_that_is_not_covered():
     layer.register_buffer("more", th.zeros(2))
     with pytest.raises(TypeError, match="other parameters or statistics"):
         MLP(layer)
+
+
+@pytest.mark.parametrize("warmup_steps", [10, -1])
+def test_fused_batch_renormalization_is_sb3_contribs(warmup_steps):
+    layers = [BatchRenorm1d(5, warmup_steps=warmup_steps).double() for _ in range(2)]
+    fuse_batch_renorm(layers[1])
+    th.manual_seed(0)
+    for layer in layers:
+        layer.ra_mean = th.linspace(-8, 8, 5, dtype=th.float64)  # clipped at both ends
+        layer.ra_var = th.linspace(0.1, 40, 5, dtype=th.float64)
+        layer.scale.data = th.linspace(-1, 2, 5, dtype=th.float64)
+    x, gradient = th.randn(2, 7, 5, dtype=th.float64)
+    results = []
+    for layer in layers:
+        given = (2 * x + 1).requires_grad_()
+        outputs = layer(given)
+        outputs.backward(gradient)
+        results.append([outputs, given.grad, *(p.grad for p in layer.parameters()), *layer.buffers()])
+        layer.eval()
+        results[-1].append(layer(x))
+    assert type(layers[1]) is FusedBatchRenorm1d
+    for expected, found in zip(*results, strict=True):
+        th.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)
+
+
+def test_a_dead_unit_has_no_gradient():
+    layer = BatchRenorm1d(2, warmup_steps=-1)
+    fuse_batch_renorm(layer)
+    layer.ra_mean += 1
+    x = th.tensor([[0.0, 1.0], [0.0, 2.0]], requires_grad=True)
+    layer(x).square().sum().backward()
+    assert th.isfinite(x.grad).all() and x.grad[:, 1].any()
+
+
+def test_mcbs_crossq_uses_fused_batch_renormalization():
+    layers = [layer for layer in agent_of(MCBSCrossQ).policy.modules() if isinstance(layer, BatchRenorm1d)]
+    assert {type(layer) for layer in layers} == {FusedBatchRenorm1d}
+
+
+def test_crossq_trains_as_sb3_contrib_does():
+    agents = []
+    for fused in (False, True):
+        agents.append(agent_of(CrossQ, {"learning_starts": 50}))
+        if fused:
+            fuse_batch_renorm(agents[-1].policy)
+        agents[-1].learn(80)
+    for name, expected in agents[0].policy.state_dict().items():
+        th.testing.assert_close(agents[1].policy.state_dict()[name], expected, rtol=1e-3, atol=1e-4)
 
 
 def test_hooks_run():

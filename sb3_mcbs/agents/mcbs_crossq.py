@@ -11,6 +11,7 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_mcbs.agents.hyperparameters import sb3_arguments
 from sb3_mcbs.agents.mcbs import MCBS
+from sb3_mcbs.networks.batch_renorm import fuse_batch_renorm
 
 
 class MCBSCrossQ(MCBS, CrossQ):
@@ -115,3 +116,7 @@ class MCBSCrossQ(MCBS, CrossQ):
 
         if _init_setup_model:
             self._setup_model()
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        fuse_batch_renorm(self.policy)

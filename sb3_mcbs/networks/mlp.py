@@ -10,6 +10,8 @@ import torch as th
 from sb3_contrib.common.torch_layers import BatchRenorm1d
 from torch import nn
 
+from sb3_mcbs.networks.batch_renorm import FusedBatchRenorm1d
+
 
 def own_state(module: nn.Module) -> dict[str, Any]:
     """A module's attributes, if calling the module does nothing but run its class's ``forward``.
@@ -144,7 +146,7 @@ class MLP:
         if type(module) is nn.Linear:
             self._layers.append(_Linear(module))
             return
-        if type(module) is BatchRenorm1d:
+        if isinstance(module, BatchRenorm1d) and type(module) in (BatchRenorm1d, FusedBatchRenorm1d):
             self._layers.append(_Normalization(module))
             return
         is_activation = type(module) in (nn.ReLU, nn.Tanh) and self._layers

@@ -23,13 +23,23 @@ from torch import nn
 from torch.nn.modules import module as torch_module
 from torch.optim import optimizer as torch_optimizer
 
+from sb3_mcbs.networks.batch_renorm import FusedBatchRenorm1d
 from sb3_mcbs.networks.mlp import MLP, own_state
 
 #: Subclasses and wrappers are not included, since they may do something else.
 _STOCHASTIC_ACTORS: tuple[type[nn.Module], ...] = (SACActor, TQCActor, CrossQActor)
 _CRITICS: tuple[type[nn.Module], ...] = (ContinuousCritic, TQCCritic, CrossQCritic)
 _NETWORKS = (TD3Actor, *_STOCHASTIC_ACTORS, *_CRITICS)
-_LAYERS = (nn.Linear, BatchRenorm1d, nn.ReLU, nn.Tanh, nn.Sequential, nn.Flatten, FlattenExtractor)
+_LAYERS = (
+    nn.Linear,
+    BatchRenorm1d,
+    FusedBatchRenorm1d,
+    nn.ReLU,
+    nn.Tanh,
+    nn.Sequential,
+    nn.Flatten,
+    FlattenExtractor,
+)
 
 
 _METHODS = {
