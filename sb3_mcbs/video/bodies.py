@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from sb3_mcbs.snapshot import SnapshotEnvWrapper, is_data, is_physics
@@ -26,13 +27,12 @@ def find_bodies(model: Any, names: Sequence[str]) -> list[int]:
     """Find bodies by name.
 
     :param model: the ``MjModel``.
-    :param names: names of bodies; none: the first body that can move.
+    :param names: names of bodies; none: the first one that can move, or the end of a fixed robot.
     :return: their numbers.
     :raises ValueError: if there is no body of a name.
     """
     if not names:
-        moving = np.flatnonzero(model.body_weldid)
-        return moving[:1].tolist()
+        return [_main_body(model)]
     known = [model.body(number).name for number in range(1, model.nbody)]
     for name in names:
         if name not in known:
@@ -40,6 +40,21 @@ def find_bodies(model: Any, names: Sequence[str]) -> list[int]:
                 f"The model has no body {name!r}. Its bodies are {', '.join(filter(None, known))}."
             )
     return [model.body(name).id for name in names]
+
+
+def _main_body(model: Any) -> int:
+    """The root of a robot that can go somewhere; the end of one that is fixed."""
+    moving = np.flatnonzero(model.body_weldid).tolist()
+    if not moving:
+        return model.nbody - 1
+    goes = (mujoco.mjtJoint.mjJNT_FREE.value, mujoco.mjtJoint.mjJNT_SLIDE.value)
+    if any(model.jnt_bodyid[joint] == moving[0] for joint in np.flatnonzero(np.isin(model.jnt_type, goes))):
+        return moving[0]
+    depths = np.zeros(model.nbody, dtype=int)
+    for body in moving:  # parents come before their children
+        if model.body_rootid[body] == model.body_rootid[moving[0]]:
+            depths[body] = depths[model.body_parentid[body]] + 1
+    return int(depths.argmax())
 
 
 def body_positions(env: SnapshotEnvWrapper, bodies: Sequence[int]) -> np.ndarray:

@@ -30,17 +30,20 @@ class _Writer(ABC):
         """Complete the file."""
 
 
+def _import_ffmpeg() -> Any:
+    try:
+        import imageio_ffmpeg
+    except ImportError as error:
+        raise ImportError(
+            'Writing .mp4 needs imageio-ffmpeg: pip install "sb3-mcbs[video]". A .gif or .png does not.'
+        ) from error
+    return imageio_ffmpeg
+
+
 class _Video(_Writer):
     def __init__(self, path: Path, fps: float) -> None:
         super().__init__(path, fps)
-        try:
-            import imageio_ffmpeg
-        except ImportError as error:
-            raise ImportError(
-                f'Writing {path.suffix} needs imageio-ffmpeg: pip install "sb3-mcbs[video]". A .gif or .png '
-                "needs nothing more."
-            ) from error
-        self._ffmpeg = imageio_ffmpeg
+        self._ffmpeg = _import_ffmpeg()
         self._stream: Any = None
 
     def add(self, draw: Callable[[], Image.Image]) -> None:
@@ -116,12 +119,15 @@ def check_path(path: str | Path) -> Path:
     :param path: of the video.
     :return: the same path.
     :raises ValueError: if its ending is unknown, or there is no such folder.
+    :raises ImportError: if a package is missing that the format needs.
     """
     path = Path(path)
     if path.suffix.lower() not in _WRITERS:
         raise ValueError(f"{path} must end with one of {', '.join(_WRITERS)}: the ending chooses the format.")
     if not path.absolute().parent.is_dir():
         raise ValueError(f"There is no folder {path.absolute().parent}.")
+    if path.suffix.lower() == ".mp4":
+        _import_ffmpeg()
     return path
 
 

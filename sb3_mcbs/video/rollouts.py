@@ -87,7 +87,8 @@ class RecordedModel(ForwardModel):
 
         :param settings: settings of the decision.
         """
-        n_sim = settings.distinct_simulations(self.deterministic)
+        # In a deterministic environment a row is all simulations of a candidate, until their noise differs.
+        n_sim = 1 if self.deterministic else settings.distinct_simulations(deterministic=False)
         found, before = [], 0
         for steps in self._rounds:
             if not steps:

@@ -258,19 +258,23 @@ def _camera(env: SnapshotEnvWrapper, model: Any) -> Any:
     """A camera that follows: the model's own, or one on the first body that moves."""
     camera = mujoco.MjvCamera()
     mujoco.mjv_defaultFreeCamera(model, camera)
-    following = (mujoco.mjtCamLight.mjCAMLIGHT_TRACK, mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM)
+    modes = mujoco.mjtCamLight
+    following = (modes.mjCAMLIGHT_TRACK.value, modes.mjCAMLIGHT_TRACKCOM.value)
     of_model = [number for number in range(model.ncam) if model.cam_mode[number] in following]
     if of_model:
         camera.type, camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, of_model[0]
         return camera
-    # Gymnasium's environments say where to look from.
+    # Many of Gymnasium's environments say where to look from.
     settings = getattr(getattr(env.unwrapped, "mujoco_renderer", None), "default_cam_config", None)
-    for name, value in (settings or {"trackbodyid": find_bodies(model, [])[0]}).items():
+    if not settings:
+        body = find_bodies(model, [])[0]
+        settings = {"trackbodyid": body, "distance": 0.8 * model.stat.extent, "elevation": -20.0}
+    for name, value in settings.items():
         if name == "lookat":
             camera.lookat[:] = value
         else:
             setattr(camera, name, value)
-    if camera.trackbodyid >= 0:
+    if camera.trackbodyid > 0:
         camera.type = mujoco.mjtCamera.mjCAMERA_TRACKING
     return camera
 
