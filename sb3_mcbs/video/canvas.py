@@ -13,6 +13,8 @@ Color = tuple[int, int, int]
 WHITE, BLACK = (255, 255, 255), (0, 0, 0)
 GREY: Color = (165, 172, 184)
 BACKGROUND: Color = (24, 27, 33)
+#: Of two curves; they differ in lightness too.
+CURVES: tuple[Color, Color] = ((230, 159, 0), (86, 180, 233))
 #: Everything is drawn larger and then reduced, which smooths it.
 _SCALE = 3
 #: The darkest colours of the colour map are hard to see before dark backgrounds.

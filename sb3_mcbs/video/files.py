@@ -1,5 +1,6 @@
 """Writes frames as a video, an animation or a strip of pictures."""
 
+import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -8,6 +9,8 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
+
+from sb3_mcbs.video.canvas import CURVES, rank_color
 
 #: A GIF has no more pictures per second, and is no wider.
 GIF_FPS, GIF_WIDTH = 12.5, 640
@@ -66,13 +69,15 @@ class _Animation(_Writer):
         self._every = max(int(np.ceil(fps / GIF_FPS)), 1)
         self._count = 0
         self._frames: list[Image.Image] = []
+        self._palette: Image.Image | None = None
 
     def add(self, draw: Callable[[], Image.Image]) -> None:
         if self._count % self._every == 0:
             frame = draw()
             size = (GIF_WIDTH, round(frame.height * GIF_WIDTH / frame.width))
             small = frame.convert("RGB").resize(size, Image.Resampling.LANCZOS)
-            self._frames.append(small.quantize(128, dither=Image.Dither.NONE))
+            self._palette = self._palette or _palette(small)
+            self._frames.append(small.quantize(palette=self._palette, dither=Image.Dither.NONE))
         self._count += 1
 
     def finish(self) -> None:
@@ -82,6 +87,15 @@ class _Animation(_Writer):
             first.save(
                 self.path, save_all=True, append_images=others, duration=duration, loop=0, optimize=True
             )
+
+
+def _palette(frame: Image.Image) -> Image.Image:
+    """Colours for all pictures of a GIF: those of one picture, and those of values and curves."""
+    of_values = [*(rank_color(number / 45) for number in range(46)), *CURVES]
+    colors = frame.quantize(256 - len(of_values)).getpalette() or []
+    palette = Image.new("P", (1, 1))
+    palette.putpalette([*colors[: 3 * (256 - len(of_values))], *itertools.chain(*of_values)])
+    return palette
 
 
 class _Strip(_Writer):

@@ -7,14 +7,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from PIL import Image
 
-from sb3_mcbs.video.canvas import BACKGROUND, BLACK, GREY, WHITE, Canvas, Color, rank_color
+from sb3_mcbs.video.canvas import BACKGROUND, BLACK, CURVES, GREY, WHITE, Canvas, rank_color
 from sb3_mcbs.video.looks import Look
 
 SIZE = (854, 480)
 #: Of the picture beside the panel, and of each of two pictures above it.
 ALONE, COMPARED = (560, 480), (427, 312)
-#: Colours of the two curves, which differ in lightness too.
-_CURVES: tuple[Color, Color] = ((230, 159, 0), (86, 180, 233))
 #: Where the policy's own action is in the chart of values; most candidates are worse.
 _ZERO = 0.68
 
@@ -98,7 +96,7 @@ class Panel:
                 (COMPARED[0] - 10, 8),
                 _number(_last(shown.returns)),
                 20,
-                _CURVES[number],
+                CURVES[number],
                 True,
                 "ra",
                 outline=True,
@@ -112,9 +110,8 @@ class Panel:
         if look is not None:
             left, right = COMPARED[0] + 14, SIZE[0] - 14
             gains = next(shown.gains for shown in reversed(both) if shown.look is look)
-            canvas.text((left, 8), f"{len(look.values)} candidates", 14, GREY)
-            text = f"gain over the policy {_signed(look.gain)}, mean {_signed(_mean(gains))}"
-            canvas.text((right, 8), text, 14, anchor="ra")
+            canvas.text((left, 8), "gain over the policy's action", 14, GREY)
+            canvas.text((right, 8), f"{_signed(look.gain)}, mean {_signed(_mean(gains))}", 14, anchor="ra")
             self._values(canvas, look, (left, 28, right, 110))
             self._legend(canvas, (left, 120, right), look, magnified)
         frame.paste(canvas.image(), (0, COMPARED[1]))
@@ -182,7 +179,7 @@ class Panel:
         canvas.text((left, 8), "return so far", 14, GREY)
         canvas.text((right, 8), f"step {steps if everything != [0.0] else 0}", 14, GREY, anchor="ra")
         upper = top + 24
-        for shown, color in zip(both, _CURVES, strict=True):
+        for shown, color in zip(both, CURVES, strict=True):
             # No more points than pixels.
             every = max(len(shown.returns) // 400, 1)
             numbers = range(0, len(shown.returns), every)

@@ -310,8 +310,8 @@ def _open_gl(model: Any, size: tuple[int, int]) -> tuple[Any, Any]:
         context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
     except Exception as error:  # every backend has errors of its own
         raise RenderingError(
-            f"MuJoCo cannot draw with {backend} here ({type(error).__name__}: {error}). Install another "
-            f"library: {_INSTALL}."
+            f"MuJoCo cannot draw with {backend} here ({type(error).__name__}: {error}). Without a screen it "
+            f"needs EGL or OSMesa: {_INSTALL}."
         ) from error
     mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, context)
     return gl, context

@@ -1,7 +1,9 @@
 """``sb3-mcbs watch AGENT --env ENV -o FILE``: a video of an agent and of what its search looks at."""
 
 import argparse
+import math
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -66,17 +68,22 @@ def _make_env(env_id: str, statistics: str | None) -> VecEnv:
     return vec_env if statistics is None else load_statistics(statistics, vec_env)
 
 
-def _positive(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise ValueError(text)
-    return value
+def _count(least: int) -> Callable[[str], int]:
+    def count(text: str) -> int:
+        if not text.isdecimal() or int(text) < least:
+            raise argparse.ArgumentTypeError(f"must be a whole number, at least {least}; got {text!r}.")
+        return int(text)
+
+    return count
 
 
-def _natural(text: str) -> int:
-    value = int(text)
-    if value < 0:
-        raise ValueError(text)
+def _factor(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"must be a number above 0; got {text!r}.")
     return value
 
 
@@ -102,9 +109,9 @@ def parser() -> argparse.ArgumentParser:
     add("--env", required=True, help="the environment to act in, for example HalfCheetah-v5 or module:Id-v0")
     add("-o", "--output", required=True, metavar="FILE", help="ends with .mp4, .gif, or .png (four moments)")
     add("--compare", action="store_true", help="show the actor alone beside it, from the same seed")
-    add("--seed", type=_natural, default=0, help="of the environment and the search (default: %(default)s)")
-    add("--steps", type=_positive, default=200, help="steps to record, at most (default: %(default)s)")
-    add("--start", type=_natural, default=0, help="steps before those, not recorded (default: %(default)s)")
+    add("--seed", type=_count(0), default=0, help="of the environment and the search (default: %(default)s)")
+    add("--steps", type=_count(1), default=200, help="steps to record, at most (default: %(default)s)")
+    add("--start", type=_count(0), default=0, help="steps before those, not recorded (default: %(default)s)")
     add(
         "--preset",
         choices=list(PRESETS),
@@ -125,7 +132,7 @@ def parser() -> argparse.ArgumentParser:
     )
     add(
         "--magnify",
-        type=float,
+        type=_factor,
         metavar="X",
         help="draw differences between rollouts X times as large (default: so that they are seen; 1: as is)",
     )
