@@ -62,6 +62,7 @@ class Canvas:
         bold: bool = False,
         anchor: str = "la",
         outline: bool = False,
+        fit: float | None = None,
     ) -> None:
         """Write a line of text.
 
@@ -72,13 +73,17 @@ class Canvas:
         :param bold: whether they are bold.
         :param anchor: Pillow's: ``"la"`` is the left end of the upper edge, ``"ra"`` the right end.
         :param outline: whether they have a black outline.
+        :param fit: the width that is there: a longer text is smaller.
         """
         x, y = (_SCALE * value for value in position)
+        font = _font(size, bold)
+        if fit is not None and font.getlength(text) > fit * _SCALE:
+            font = _font(size * fit * _SCALE / font.getlength(text), bold)
         self._draw.text(
             (x, y),
             text,
             fill=color,
-            font=_font(size, bold),
+            font=font,
             anchor=anchor,
             stroke_width=2 * _SCALE if outline else 0,
             stroke_fill=BLACK,

@@ -59,8 +59,8 @@ class Panel:
         frame.paste(picture)
         canvas = Canvas(SIZE[0] - ALONE[0], SIZE[1])
         left, right = 14, canvas.width - 14
-        canvas.text((left, 10), self.title, 17, bold=True)
-        canvas.text((left, 33), self.subtitle, 13, GREY)
+        canvas.text((left, 10), self.title, 17, bold=True, fit=right - left)
+        canvas.text((left, 33), self.subtitle, 13, GREY, fit=right - left)
         canvas.text((left, 60), "return so far", 14, GREY)
         canvas.text((left, 77), _number(_last(shown.returns)), 28, bold=True)
         canvas.text((right, 60), "step", 14, GREY, anchor="ra")
@@ -91,7 +91,7 @@ class Panel:
             corner = (number * COMPARED[0], 0)
             frame.paste(picture, corner)
             label = Canvas(*COMPARED, background=None)
-            label.text((10, 8), shown.label, 16, bold=True, outline=True)
+            label.text((10, 8), shown.label, 16, bold=True, outline=True, fit=COMPARED[0] - 120)
             label.text(
                 (COMPARED[0] - 10, 8),
                 _number(_last(shown.returns)),

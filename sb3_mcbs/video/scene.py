@@ -214,14 +214,14 @@ class View:
 
 
 def _draw_traces(canvas: Canvas, look: Look, view: View, magnified: float) -> None:
-    """Draw low values first, then the policy's own action, then what was chosen."""
+    """Draw low values first, then what was chosen, and the policy's own action on top."""
     assert look.own is not None
     ranks = look.ranks
     valid = [trace for trace in look.traces if np.isfinite(look.values[trace[0]])]
     others = [trace for trace in valid if trace[0] != look.chosen]
     ways = [(way, rank_color(ranks[index]), 2.5) for index, way in sorted(others, key=lambda t: ranks[t[0]])]
-    ways.append((look.own, WHITE, 2.5))
     ways += [(way, rank_color(ranks[index]), 6.0) for index, way in valid if index == look.chosen]
+    ways.append((look.own, WHITE, 2.0))
     for way, color, width in ways:
         apart = _apart(way, look.own)
         shown = look.own[: len(apart)] + magnified * apart
