@@ -19,7 +19,15 @@ STRIP = 4
 
 
 class _Writer(ABC):
-    """:param path: the file. :param fps: pictures per second."""
+    """
+    A file of pictures.
+
+    :param path: the file
+    :param fps: pictures per second
+    """
+
+    #: Whether the pictures follow one another in time.
+    plays = True
 
     def __init__(self, path: Path, fps: float) -> None:
         self.path, self.fps = path, fps
@@ -100,6 +108,8 @@ def _palette(frame: Image.Image) -> Image.Image:
 
 class _Strip(_Writer):
     """Keeps a few pictures at equal distances, however many there will be."""
+
+    plays = False
 
     def __init__(self, path: Path, fps: float) -> None:
         super().__init__(path, fps)

@@ -122,7 +122,7 @@ class Panel:
         left, top, right, bottom = box
         values = look.values[np.isfinite(look.values)]
         if not len(values):
-            canvas.text((left, top), "no candidate could be simulated", 14)
+            canvas.text((left, top), "nothing to compare", 14)
             return
         order = [
             index for index in np.argsort(-look.values, kind="stable") if np.isfinite(look.values[index])

@@ -101,7 +101,7 @@ def record_episodes(
                 for _ in _act(stages, seed, start, steps):
                     video.add(frame)
                     bar.update()
-                if all(stage.shown.ended for stage in stages):
+                if video.plays and all(stage.shown.ended for stage in stages):
                     for _ in range(round(stages[0].fps)):  # long enough to read how it ended
                         video.add(frame)
                 outcomes += [stage.outcome(seed) for stage in stages]
@@ -109,27 +109,6 @@ def record_episodes(
         for stage in stages:
             stage.close()
     return outcomes
-
-
-def _act(stages: "Sequence[_Stage]", seed: int, start: int, steps: int | None) -> Iterator[None]:
-    """Act for an episode. Stops after every decision from ``start`` on, before its action is executed."""
-    for stage in stages:
-        stage.reset(seed)
-    for number in itertools.count() if steps is None else range(start + steps):
-        ended = [stage for stage in stages if stage.shown.ended]
-        if ended and number <= start:
-            raise ValueError(
-                f"The episode with seed {seed} ended after {len(ended[0].shown.returns)} steps, before step "
-                f"{start}, from which it was to be recorded."
-            )
-        if len(ended) == len(stages):
-            return
-        for stage in stages:
-            stage.decide()
-        if number >= start:
-            yield
-        for stage in stages:
-            stage.step()
 
 
 class _Stage:
@@ -160,10 +139,11 @@ class _Stage:
         """Begin an episode."""
         self.vec_env.seed(seed)
         self._observations: Any = self.vec_env.reset()
+        self._picture = None
         self.shown = Shown(self.label)
 
     def decide(self) -> None:
-        """Choose an action, and draw the state in which it was chosen."""
+        """Choose an action."""
         if self.shown.ended:
             return
         if self._onlooker is not None:
@@ -174,8 +154,8 @@ class _Stage:
             self._action, _ = self.policy.predict(self._observations, deterministic=True)
 
     def draw(self) -> Image.Image:
-        """The picture of the last decision."""
-        if self._picture is None or not self.shown.ended:  # afterwards the environment is in the next episode
+        """The picture of the last decision, or of the last one that was drawn if the episode has ended."""
+        if self._picture is None or not self.shown.ended:
             self._picture = self.scene.draw(self.shown.look)
         return self._picture
 
@@ -204,6 +184,27 @@ class _Stage:
         if self._onlooker is not None:
             self._onlooker.close()
         self.scene.close()
+
+
+def _act(stages: Sequence[_Stage], seed: int, start: int, steps: int | None) -> Iterator[None]:
+    """Act for an episode. Stops after every decision from ``start`` on, before its action is executed."""
+    for stage in stages:
+        stage.reset(seed)
+    for number in itertools.count() if steps is None else range(start + steps):
+        ended = [stage for stage in stages if stage.shown.ended]
+        if ended and number <= start:
+            raise ValueError(
+                f"The episode with seed {seed} ended after {len(ended[0].shown.returns)} steps, before step "
+                f"{start}, from which it was to be recorded."
+            )
+        if len(ended) == len(stages):
+            return
+        for stage in stages:
+            stage.decide()
+        if number >= start:
+            yield
+        for stage in stages:
+            stage.step()
 
 
 def _single_environment(vec_env: VecEnv) -> SnapshotEnvWrapper:
