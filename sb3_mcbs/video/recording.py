@@ -21,6 +21,9 @@ from sb3_mcbs.video.looks import Onlooker
 from sb3_mcbs.video.panel import ALONE, COMPARED, Panel, Shown
 from sb3_mcbs.video.scene import EnvironmentPicture, MujocoScene
 
+#: Some environments make 125 steps per second.
+_MOST_FPS = 30.0
+
 
 class Performer(NamedTuple):
     """
@@ -132,8 +135,8 @@ class _Stage:
 
     @property
     def fps(self) -> float:
-        """Steps per second, as the environment says."""
-        return float(self._env.metadata.get("render_fps") or 30)
+        """Steps per second as in reality, or fewer so that each can be seen."""
+        return min(float(self._env.metadata.get("render_fps") or _MOST_FPS), _MOST_FPS)
 
     def reset(self, seed: int) -> None:
         """Begin an episode."""
