@@ -1,6 +1,7 @@
 """Environments as commands name them: an id, ``module:Id``, or a function in a Python file."""
 
 import importlib.util
+import os
 import sys
 import traceback
 from collections.abc import Callable, Sequence
@@ -34,6 +35,8 @@ def find_environment(name: str, wrappers: Sequence[Any] = ()) -> Callable[..., g
     :return: makes the environment with its wrappers, from keyword arguments
     :raises NoEnvironmentError: if the file cannot be read, or there is no such function or wrapper
     """
+    if os.getcwd() not in sys.path and "" not in sys.path:  # as with python -m
+        sys.path.insert(0, os.getcwd())
     make = _function_in_file(name) if is_file(name) else _registered(name)
     try:
         wrap = get_wrapper_class({"env_wrapper": list(wrappers)}) if wrappers else None
@@ -63,9 +66,8 @@ def _registered(name: str) -> Callable[..., gym.Env]:
         try:
             return gym.make(name, **kwargs)
         except (gym.error.UnregisteredEnv, ModuleNotFoundError) as error:
-            raise NoEnvironmentError(
-                f"{error} Environments of another package are found as module:{name.rpartition(':')[2]}."
-            ) from error
+            hint = "" if ":" in name else f" Those of another package are found as module:{name}."
+            raise NoEnvironmentError(f"{error}{hint}") from error
 
     return make
 
@@ -95,8 +97,8 @@ def _function_in_file(name: str) -> Callable[..., gym.Env]:
             if callable(value) and getattr(value, "__module__", None) == path.stem
         ]
         raise NoEnvironmentError(
-            f"{file} has no function {function!r}: write {file}:FUNCTION with one that returns the "
-            f"environment. It has {', '.join(own) or 'none'}."
+            f"{f'{file} has no function {function!r}' if function else 'The function is missing'}: write "
+            f"{file}:FUNCTION with one that returns the environment. There is {', '.join(own) or 'none'}."
         )
 
     def checked(**kwargs: Any) -> gym.Env:

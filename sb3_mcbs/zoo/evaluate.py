@@ -205,7 +205,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("path", type=Path, help="the folder of an RL Zoo run, or an agent's zip")
     parser.add_argument("--env", help=f"the environment of a zip: {ENV_HELP}")
     parser.add_argument(
-        "--wrapper", nargs="+", default=[], help="its wrappers (module.Class), innermost first"
+        "--wrapper", nargs="+", metavar="W", default=[], help="its wrappers (module.Class), innermost first"
     )
     parser.add_argument(
         "--algo", choices=ALGORITHMS, metavar="ALGO", help="td3, mcbs_sac, ...: if it cannot be inferred"
