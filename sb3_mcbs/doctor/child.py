@@ -17,12 +17,18 @@ from sb3_mcbs.agents import SearchPolicy
 from sb3_mcbs.agents.episodes import play
 from sb3_mcbs.agents.registry import BASELINES
 from sb3_mcbs.doctor import questions
-from sb3_mcbs.loading import AgentFileError, load_agent
+from sb3_mcbs.loading import load_agent
 from sb3_mcbs.models import ForwardModelError
 from sb3_mcbs.search import PRESETS
 from sb3_mcbs.snapshot import SnapshotError
 from sb3_mcbs.snapshot.verification import InexactError
-from sb3_mcbs.zoo.environments import NoEnvironmentError, find_environment, in_words, make_searchable
+from sb3_mcbs.zoo.environments import (
+    NoEnvironmentError,
+    find_environment,
+    in_words,
+    make_searchable,
+    normalized,
+)
 
 #: A decision that would take longer is not measured.
 MOST_SECONDS = 10.0
@@ -99,34 +105,38 @@ class Examination:
         env.close()
 
         self._begin("taking snapshots")
-        statistics = None if request.statistics is None else Path(request.statistics)
-        try:
-            vec_env = make_searchable(make, statistics, request.trusted)
-        except (AgentFileError, PermissionError) as error:
-            raise questions.UnsuitableError(str(error)) from error
+        vec_env = make_searchable(make)
         wrapper = vec_env.unwrapped.envs[0]  # type: ignore[attr-defined]
         self._find("snapshot", questions.check_snapshots(wrapper))
         self._begin("making a forward model")
         self._find("forward_model", questions.forward_model(wrapper))
 
-        agent = self._agent(vec_env)
+        agent, vec_env = self._agent(vec_env)
         milliseconds = self._costs(agent, vec_env)
         if request.agent is not None:
             self._returns(agent, vec_env, milliseconds)
 
-    def _agent(self, env: VecEnv) -> OffPolicyAlgorithm:
+    def _agent(self, env: VecEnv) -> tuple[OffPolicyAlgorithm, VecEnv]:
         self._begin("loading the agent")
         if self.request.agent is None:
-            return questions.untrained_agent(env)
+            return questions.untrained_agent(env), env
         try:
+            statistics = None if self.request.statistics is None else Path(self.request.statistics)
+            env = normalized(env, statistics, self.request.trusted)
             agent = load_agent(self.request.agent, env, device="cpu")
         except (OSError, ValueError) as error:
             raise questions.UnsuitableError(str(error)) from error
         normalizer = unwrap_vec_normalize(env)
         flags = None if normalizer is None else {key: getattr(normalizer, key) for key in _FLAGS}
-        about = {"algorithm": type(agent).__name__, "base": _base(agent), "normalize": flags}
+        about = {
+            "algorithm": type(agent).__name__,
+            "base": _base(agent),
+            "normalize": flags,
+            "file": self.request.agent,
+            "statistics": self.request.statistics,
+        }
         self._find("agent", about)
-        return agent
+        return agent, env
 
     def _costs(self, agent: OffPolicyAlgorithm, env: VecEnv) -> dict[str, float]:
         """Measure the presets. Return the milliseconds of a decision with each."""

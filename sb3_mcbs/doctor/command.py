@@ -8,7 +8,7 @@ from pathlib import Path
 from sb3_mcbs.doctor.child import Request
 from sb3_mcbs.doctor.isolation import examine
 from sb3_mcbs.doctor.report import block, lines, verdict
-from sb3_mcbs.zoo.environments import ENV_HELP, statistics_beside
+from sb3_mcbs.zoo.environments import ENV_HELP, check_trust, statistics_beside
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -57,6 +57,10 @@ def main() -> None:
     statistics = args.vecnormalize
     if statistics is None and args.agent is not None:
         statistics = statistics_beside(args.agent)
+    try:
+        check_trust(statistics, args.trusted)
+    except OSError as error:
+        parser.error(str(error))
     request = Request(
         args.environment,
         args.wrapper,

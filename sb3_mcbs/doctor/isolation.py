@@ -51,7 +51,7 @@ def examine(request: Request, limit: float, on_stage: Callable[[str], None]) -> 
         )
         os.close(writing)
         try:
-            findings = _Findings(on_stage)
+            findings = Findings(on_stage)
             in_time = _follow(process, pipe, findings, limit)
             if not findings.ended:
                 _note_end(process, output, findings.found, None if in_time else limit)
@@ -60,7 +60,7 @@ def examine(request: Request, limit: float, on_stage: Callable[[str], None]) -> 
     return findings.found
 
 
-class _Findings:
+class Findings:
     """What the process has told so far."""
 
     def __init__(self, on_stage: Callable[[str], None]) -> None:
@@ -88,7 +88,7 @@ class _Findings:
                 found[name] = value
 
 
-def _follow(process: subprocess.Popen[bytes], pipe: IO[str], findings: _Findings, limit: float) -> bool:
+def _follow(process: subprocess.Popen[bytes], pipe: IO[str], findings: Findings, limit: float) -> bool:
     """Take in what the process says until it ends. Return whether each stage ended in time."""
     os.set_blocking(pipe.fileno(), False)
     selector = selectors.DefaultSelector()

@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_mcbs.agents import SearchPolicy
 from sb3_mcbs.models import LocalEnvironments, make_forward_model
-from sb3_mcbs.snapshot import SnapshotEnvWrapper
+from sb3_mcbs.snapshot import ReplayAdapter, SnapshotAdapter, SnapshotEnvWrapper
 from sb3_mcbs.snapshot.registry import find_adapter
 from sb3_mcbs.snapshot.spaces import random_action
 
@@ -114,25 +114,24 @@ def check_snapshots(wrapper: SnapshotEnvWrapper) -> dict[str, Any]:
         snapshot = wrapper.snapshot()
         wrapper.restore(snapshot)
         seconds.append(time.perf_counter() - start)
+    found = adapters(wrapper)
     return {
         "steps_compared": n_steps,
-        "captured_by": adapters(wrapper),
+        "captured_by": [type(each).__name__ + (f" ({each.what})" if each.what else "") for each in found],
+        "replays": any(each.what == ReplayAdapter.what for each in found),
         "bytes": len(pickle.dumps(snapshot)),
         "milliseconds": 1000 * statistics.median(seconds),
     }
 
 
-def adapters(wrapper: SnapshotEnvWrapper) -> list[str]:
+def adapters(wrapper: SnapshotEnvWrapper) -> list[SnapshotAdapter]:
     """Which adapters capture its simulators?
 
     :param wrapper: the environment.
-    :return: their classes, and what each captures; none if all state is in Python's attributes.
+    :return: one of each class; none if all state is in Python's attributes.
     """
     found = {type(adapter): adapter for adapter in map(find_adapter, wrapper.simulators) if adapter}
-    return [
-        f"{kind.__name__} ({adapter.what})" if adapter.what else kind.__name__
-        for kind, adapter in found.items()
-    ]
+    return list(found.values())
 
 
 def forward_model(wrapper: SnapshotEnvWrapper) -> dict[str, Any]:

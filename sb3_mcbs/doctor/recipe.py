@@ -14,7 +14,7 @@ FAST, NOTHING_SIMULATED = "HalfCheetah-v5", "LunarLanderContinuous-v3"
 _SNAPSHOTS = "sb3_mcbs.SnapshotEnvWrapper"
 
 
-def recipe(findings: dict[str, Any], name: str, wrappers: list[str], exact: bool, fast: bool) -> str:
+def recipe(findings: dict[str, Any], name: str, wrappers: list[str], exact: bool, simulate: bool) -> str:
     """
     Write an entry of a hyperparameter file, below comments that say how to use it.
 
@@ -22,13 +22,13 @@ def recipe(findings: dict[str, Any], name: str, wrappers: list[str], exact: bool
     :param name: of the environment
     :param wrappers: of the environment
     :param exact: whether it can be simulated exactly
-    :param fast: whether that is fast
+    :param simulate: whether training can afford to simulate
     :return: YAML
     """
     algo = f"mcbs_{findings.get('agent', {}).get('base', 'td3')}"
     known = yaml.safe_load(hyperparams_path(algo).read_text())
     module, _, function = name.rpartition(":")
-    env_id = Path(module).stem.title().replace("_", "") + "-v0" if is_file(name) else function
+    env_id = f"{findings['environment']['class']}-v0" if is_file(name) else function
     command = f"python -m rl_zoo3.train --algo {algo} --env {env_id} -conf doctor.yml"
     lines = [f"# {command}" + (" \\" if module else "")]
     if module:
@@ -41,25 +41,25 @@ def recipe(findings: dict[str, Any], name: str, wrappers: list[str], exact: bool
             "# and train in its folder.",
         ]
     entry = known.get(env_id) if not wrappers else None
-    if entry is None or not exact or (entry.get("rollout_depth") == 0) == fast:
+    if entry is None or not exact or (entry.get("rollout_depth") == 0) == simulate:
         base = known.get(env_id, known["default"])
         entry = {key: value for key, value in base.items() if key not in SETTINGS}
-        entry |= _search(known, findings, exact, fast)
-    elif not module:
-        lines.append("# This is the entry that sb3-mcbs has anyway, so -conf may be left out.")
+        entry |= _search(known, findings, exact, simulate)
     layers = [*wrappers, _SNAPSHOTS] if exact else wrappers
     entry = {key: value for key, value in entry.items() if key != "env_wrapper"}
     if findings.get("agent", {}).get("normalize"):
         entry["normalize"] = str(findings["agent"]["normalize"])
     if layers:
         entry["env_wrapper"] = layers if len(layers) > 1 else layers[0]
+    if not module and entry == known.get(env_id):
+        lines.append("# This is the entry that sb3-mcbs has anyway, so -conf may be left out.")
     return "\n".join([*lines, yaml.safe_dump({env_id: entry}, sort_keys=False).rstrip()])
 
 
-def _search(known: dict[str, Any], findings: dict[str, Any], exact: bool, fast: bool) -> dict[str, Any]:
+def _search(known: dict[str, Any], findings: dict[str, Any], exact: bool, simulate: bool) -> dict[str, Any]:
     """The settings of a search that suits an environment."""
     model = findings.get("forward_model", {})
-    if not exact or not fast:
+    if not exact or not simulate:
         like = known[NOTHING_SIMULATED]
     elif not model["deterministic"]:
         like = known["default"]

@@ -1,5 +1,6 @@
 """The doctor's verdict, and its report in words."""
 
+import math
 import statistics
 import textwrap
 from collections.abc import Iterator
@@ -11,6 +12,8 @@ from sb3_mcbs.doctor.recipe import recipe
 EXACT_AND_FAST, SLOW, DOES_NOT_WORK = 0, 1, 2
 #: A decision of the preset "efficient" that takes no more milliseconds is fast, whatever simulates it.
 FAST = 20.0
+#: The same for training with it.
+AFFORDABLE = 100.0
 _WIDTH = 80
 _LABEL = 15
 
@@ -24,8 +27,16 @@ def verdict(findings: dict[str, Any]) -> int:
         return DOES_NOT_WORK
     if findings["forward_model"]["kind"] == "mujoco":
         return EXACT_AND_FAST
+    return EXACT_AND_FAST if milliseconds(findings) <= FAST else SLOW
+
+
+def milliseconds(findings: dict[str, Any]) -> float:
+    """
+    :param findings: of an examination
+    :return: of a decision with the preset "efficient"
+    """
     times = [cost.get("milliseconds") for cost in findings["costs"] if cost["preset"] == "efficient"]
-    return EXACT_AND_FAST if times and times[0] is not None and times[0] <= FAST else SLOW
+    return times[0] if times and times[0] is not None else math.inf
 
 
 def block(findings: dict[str, Any], name: str, wrappers: list[str]) -> str | None:
@@ -36,9 +47,10 @@ def block(findings: dict[str, Any], name: str, wrappers: list[str]) -> str | Non
     :return: an entry of a hyperparameter file; None if no agent of this package can be trained
     """
     if "problem" not in findings:
-        return recipe(findings, name, wrappers, exact=True, fast=verdict(findings) == EXACT_AND_FAST)
+        affordable = not findings["snapshot"]["replays"] and milliseconds(findings) <= AFFORDABLE
+        return recipe(findings, name, wrappers, exact=True, simulate=affordable)
     if findings["stage"] == "taking snapshots" and "steps_per_second" in findings:
-        return recipe(findings, name, wrappers, exact=False, fast=False)
+        return recipe(findings, name, wrappers, exact=False, simulate=False)
     return None
 
 
@@ -55,6 +67,8 @@ def lines(findings: dict[str, Any], name: str, block_text: str | None) -> Iterat
         yield from _snapshot(findings["snapshot"])
     if "forward_model" in findings:
         yield from _forward_model(findings["forward_model"])
+    if "agent" in findings:
+        yield from _agent(findings["agent"])
     if findings["costs"]:
         yield from _costs(findings)
     if findings["episodes"]:
@@ -62,7 +76,10 @@ def lines(findings: dict[str, Any], name: str, block_text: str | None) -> Iterat
     yield ""
     yield from _verdict(findings)
     if block_text is not None:
-        yield from ["", "To train with RL Zoo, save this as doctor.yml:", "", block_text]
+        how = "To train with RL Zoo, save this as doctor.yml:"
+        if "problem" in findings:
+            how = "Without simulating, the critics can rank the candidates. For RL Zoo, as doctor.yml:"
+        yield from ["", how, "", block_text]
 
 
 def _entry(label: str, *texts: str) -> Iterator[str]:
@@ -112,23 +129,35 @@ def _forward_model(found: dict[str, Any]) -> Iterator[str]:
     yield from _entry("Dynamics", says)
 
 
+def _agent(found: dict[str, Any]) -> Iterator[str]:
+    yield from _entry("Agent", f"{found['algorithm']} from {found['file']}")
+    if found["statistics"] is not None:
+        yield from _entry("", f"observations normalized with {found['statistics']}")
+
+
 def _costs(findings: dict[str, Any]) -> Iterator[str]:
     period = findings["environment"]["control_period"]
     who = findings["agent"]["algorithm"] if "agent" in findings else "untrained TD3, layers of 400 and 300"
     yield from ["", f"Cost of a decision on this machine ({who})"]
-    yield f"  {'preset':12} {'simulated steps':>15} {'ms':>8} {'of the control period':>22} {'steps/s':>8}"
+    of_period = "" if period is None else "of control period"
+    yield f"  {'preset':12} {'simulated steps':>15} {'ms':>9} {'steps/s':>9} {of_period:>18}".rstrip()
+    reason = None
     for cost in findings["costs"]:
+        start = f"  {cost['preset']:12} "
         if "unsuitable" in cost:
-            text = f"  {cost['preset']:12} not here: {cost['unsuitable']}"
-            yield from textwrap.wrap(text, _WIDTH, subsequent_indent=" " * 15)
+            text = "not here either" if cost["unsuitable"] == reason else f"not here: {cost['unsuitable']}"
+            reason = cost["unsuitable"]
+            yield from textwrap.wrap(start + text, _WIDTH, subsequent_indent=" " * _LABEL)
         elif "too_slow" in cost:
-            yield f"  {cost['preset']:12} not measured: about {cost['too_slow']:.0f} s per decision"
+            yield f"{start}not measured: about {cost['too_slow']:,.0f} s per decision"
         else:
             share = "" if period is None else f"{cost['milliseconds'] / 1000 / period:.0%}"
-            yield (
-                f"  {cost['preset']:12} {cost['simulated_steps']:15.0f} {cost['milliseconds']:8.3g} "
-                f"{share:>22} {cost['steps_per_second']:8.3g}"
-            )
+            numbers = f"{_short(cost['milliseconds']):>9} {_short(cost['steps_per_second']):>9}"
+            yield f"{start}{cost['simulated_steps']:15,.0f} {numbers} {share:>18}".rstrip()
+
+
+def _short(number: float) -> str:
+    return f"{number:,.1f}" if number < 100 else f"{number:,.0f}"
 
 
 def _episodes(findings: dict[str, Any]) -> Iterator[str]:
@@ -141,7 +170,8 @@ def _episodes(findings: dict[str, Any]) -> Iterator[str]:
         simulated = sum(episode["simulated_steps"] for episode in policy["episodes"])
         yield f"  {policy['policy']:12} {mean:15.1f} {simulated:17,}"
     for skipped in findings["not_played"]:
-        yield f"  {skipped['preset']:12} not played: it would take about {skipped['seconds']:,.0f} s"
+        seconds = f"{skipped['seconds']:,.0f} s"
+        yield f"  {skipped['preset']:12} not played, as it takes about {seconds}: see sb3-mcbs evaluate"
 
 
 def _verdict(findings: dict[str, Any]) -> Iterator[str]:
@@ -151,21 +181,21 @@ def _verdict(findings: dict[str, Any]) -> Iterator[str]:
     elif status == SLOW:
         yield from _entry("Verdict", "Look-ahead is exact, but slow.", _how_to_be_faster(findings))
     else:
-        yield from _entry("Verdict", "Look-ahead does not work.")
+        of_agent = findings["stage"] == "loading the agent"
+        yield from _entry("Verdict", "The agent cannot be used." if of_agent else "Look-ahead does not work.")
         yield from _entry("Problem", findings["problem"])
         if "advice" in findings:
             yield from _entry("Advice", findings["advice"])
 
 
 def _how_to_be_faster(findings: dict[str, Any]) -> str:
-    if any("Replay" in adapter or "Box2D" in adapter for adapter in findings["snapshot"]["captured_by"]):
+    if findings["snapshot"]["replays"]:
         return (
             "A restore repeats the episode, so decisions take the longer the later they are: let the critics "
             "alone rank the candidates (rollout_depth: 0), as below, or learn a model (forward_model: "
             "ensemble)."
         )
     return (
-        "Simulating takes as long as the environment's own steps: make those faster, or let the critics "
-        "alone rank the candidates (rollout_depth: 0), as below. Environments that simulate with MuJoCo "
-        "can be given a family (docs/forward_models.md)."
+        "Simulating takes as long as the environment's own steps: make those faster, or if it simulates with "
+        "MuJoCo, give it a family (docs/forward_models.md)."
     )

@@ -120,35 +120,49 @@ def in_words(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}{where}"
 
 
-def make_searchable(
-    make: Callable[..., gym.Env],
-    statistics: Path | None = None,
-    trusted: bool = False,
-    **kwargs: Any,
-) -> VecEnv:
+def make_searchable(make: Callable[..., gym.Env], **kwargs: Any) -> VecEnv:
     """
     Make a single vectorized environment to search in.
 
     :param make: from :func:`find_environment`
-    :param statistics: of a ``VecNormalize``, as npz, or as a pickle of a trusted author; None: none
-    :param trusted: whether the pickle's author is trusted with this machine
     :param kwargs: of the environment
-    :return: the environment, with normalised observations if there are statistics
-    :raises PermissionError: if a pickle's author is not trusted
     """
+    return make_vec_env(make, env_kwargs=kwargs, wrapper_class=SnapshotEnvWrapper)
+
+
+def check_trust(statistics: Path | None, trusted: bool) -> None:
+    """
+    :param statistics: the file with statistics of a ``VecNormalize``; None: none
+    :param trusted: whether the author of a pickle is trusted with this machine
+    :raises PermissionError: if it is a pickle, and its author is not trusted
+    :raises FileNotFoundError: if it is not there
+    """
+    if statistics is not None and not statistics.is_file():
+        raise FileNotFoundError(f"There is no file {statistics}.")
     if statistics is not None and statistics.suffix != ".npz" and not trusted:
         raise PermissionError(
             f"{statistics} is a pickle: reading it runs whatever code its author put in. If it is yours, or "
             "you trust its author, say so with --trusted; or see sb3-mcbs convert-statistics."
         )
-    env = make_vec_env(make, env_kwargs=kwargs, wrapper_class=SnapshotEnvWrapper)
+
+
+def normalized(env: VecEnv, statistics: Path | None, trusted: bool) -> VecEnv:
+    """
+    Normalize observations as in training.
+
+    :param env: the environment
+    :param statistics: of a ``VecNormalize``, as npz, or as a pickle of a trusted author; None: none
+    :param trusted: whether the pickle's author is trusted with this machine
+    :return: the environment itself if there are no statistics
+    """
+    check_trust(statistics, trusted)
     if statistics is None:
         return env
     if statistics.suffix == ".npz":
         return load_statistics(statistics, env)
-    normalized = VecNormalize.load(str(statistics), env)
-    normalized.training = False
-    return normalized
+    normalizer = VecNormalize.load(str(statistics), env)
+    normalizer.training = False
+    return normalizer
 
 
 def statistics_beside(file: Path) -> Path | None:

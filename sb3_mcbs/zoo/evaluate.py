@@ -24,6 +24,7 @@ from sb3_mcbs.zoo.environments import (
     ENV_HELP,
     find_environment,
     make_searchable,
+    normalized,
     statistics_beside,
 )
 from sb3_mcbs.zoo.evaluations import ACTOR, SEARCH
@@ -246,7 +247,7 @@ def main() -> None:
         subject = find_subject(args.path, args.env, args.wrapper)
         statistics = args.vecnormalize or subject.statistics
         make = find_environment(subject.environment, subject.wrappers)
-        env = make_searchable(make, statistics, args.trusted, **subject.env_kwargs)
+        env = normalized(make_searchable(make, **subject.env_kwargs), statistics, args.trusted)
         agent = load_agent(subject.file, env, args.algo or subject.algo)
         _show(subject, statistics, agent, evaluate(agent, env, args.preset, seeds), seeds, args.json)
     except (OSError, ValueError, TypeError, SnapshotError, ForwardModelError) as error:
