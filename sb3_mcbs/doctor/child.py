@@ -117,9 +117,10 @@ class Examination:
             self._returns(agent, vec_env, milliseconds)
 
     def _agent(self, env: VecEnv) -> tuple[OffPolicyAlgorithm, VecEnv]:
-        self._begin("loading the agent")
         if self.request.agent is None:
+            self._begin("making an agent")
             return questions.untrained_agent(env), env
+        self._begin("loading the agent")
         try:
             statistics = None if self.request.statistics is None else Path(self.request.statistics)
             env = normalized(env, statistics, self.request.trusted)

@@ -70,8 +70,12 @@ def main() -> None:
         args.episodes,
         args.time_limit / 2,
     )
-    findings = examine(request, args.time_limit, _show_progress)
-    _show_progress("")
+    try:
+        findings = examine(request, args.time_limit, _show_progress)
+    except KeyboardInterrupt:
+        sys.exit(130)
+    finally:
+        _show_progress("")
     status = verdict(findings)
     text = block(findings, args.environment, args.wrapper)
     if args.json:

@@ -4,7 +4,7 @@ import contextlib
 import json
 import os
 import re
-import selectors
+import select
 import signal
 import subprocess
 import sys
@@ -40,7 +40,7 @@ def examine(request: Request, limit: float, on_stage: Callable[[str], None]) -> 
     """
     reading, writing = os.pipe()
     command = [sys.executable, "-X", "faulthandler", "-m", "sb3_mcbs.doctor.child"]
-    with tempfile.TemporaryFile("w+", errors="replace") as output, os.fdopen(reading) as pipe:
+    with tempfile.TemporaryFile("w+", errors="replace") as output:
         process = subprocess.Popen(
             [*command, json.dumps(request._asdict()), str(writing)],
             stdin=subprocess.DEVNULL,
@@ -52,16 +52,21 @@ def examine(request: Request, limit: float, on_stage: Callable[[str], None]) -> 
         os.close(writing)
         try:
             findings = Findings(on_stage)
-            in_time = _follow(process, pipe, findings, limit)
+            in_time = _follow(process, reading, findings, limit)
             if not findings.ended:
                 _note_end(process, output, findings.found, None if in_time else limit)
         finally:
             _end(process)
+            os.close(reading)
     return findings.found
 
 
 class Findings:
-    """What the process has told so far."""
+    """
+    What the process has told so far.
+
+    :param on_stage: told of each stage that begins
+    """
 
     def __init__(self, on_stage: Callable[[str], None]) -> None:
         self.found: dict[str, Any] = {"stage": "starting Python"}
@@ -70,7 +75,9 @@ class Findings:
         self._on_stage = on_stage
 
     def add(self, message: dict[str, Any]) -> None:
-        """Take over a message of the process."""
+        """
+        :param message: of the process
+        """
         found = self.found
         if "end" in message:
             self.ended = True
@@ -88,28 +95,31 @@ class Findings:
                 found[name] = value
 
 
-def _follow(process: subprocess.Popen[bytes], pipe: IO[str], findings: Findings, limit: float) -> bool:
+def _follow(process: subprocess.Popen[bytes], pipe: int, findings: Findings, limit: float) -> bool:
     """Take in what the process says until it ends. Return whether each stage ended in time."""
-    os.set_blocking(pipe.fileno(), False)
-    selector = selectors.DefaultSelector()
-    selector.register(pipe, selectors.EVENT_READ)
-    heard, rest = time.monotonic(), ""
+    heard, rest = time.monotonic(), b""
     while not findings.ended:
         lives = process.poll() is None
-        if selector.select(_LOOK):
-            data = pipe.read()
-            lines = (rest + (data or "")).split("\n")
-            rest = lines.pop()
+        if select.select([pipe], [], [], _LOOK)[0]:
+            data = os.read(pipe, 2**16)
+            if not data:  # nobody can write any more
+                return _ends(process, limit)
+            *lines, rest = (rest + data).split(b"\n")
             for line in lines:
                 findings.add(json.loads(line))
                 heard = time.monotonic()
-            if data == "":  # nobody can write any more
-                process.wait()
-                return True
-        elif not lives:
+        elif not lives:  # what it has started may keep the pipe open
             return True
         if time.monotonic() - heard > (limit if findings.begun else max(limit, _START)):
             return False
+    return True
+
+
+def _ends(process: subprocess.Popen[bytes], limit: float) -> bool:
+    try:
+        process.wait(limit)
+    except subprocess.TimeoutExpired:
+        return False
     return True
 
 

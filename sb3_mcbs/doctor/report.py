@@ -110,7 +110,7 @@ def _snapshot(found: dict[str, Any]) -> Iterator[str]:
     by = " and ".join(found["captured_by"]) or "no adapter: all state is in Python's attributes"
     yield from _entry(
         "Snapshots",
-        f"exact: {found['steps_compared']} steps compared bit by bit, after restores and in copies",
+        f"exact: {found['steps_compared']} steps compared, bit by bit",
         f"captured by {by}" if found["captured_by"] else by,
         f"{_bytes(found['bytes'])}, {found['milliseconds']:.2g} ms to take and restore one",
     )
