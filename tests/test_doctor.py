@@ -106,6 +106,13 @@ def test_random_dynamics_are_exact_but_some_presets_are_not_for_them() -> None:
     assert "random: every simulation draws" in text(found, f"{ENVS}:Windy")
 
 
+def test_observations_of_several_parts() -> None:
+    names = ("Pendulum-v1", "tests.conftest.DictPendulum")
+    found = findings(*names)
+    assert found["environment"]["observations"] == "Dict of angle, speed" and len(found["costs"]) == 4
+    assert settings(found, *names)["policy"] == "MultiInputPolicy"
+
+
 def test_box2d_replays_the_episode_so_nothing_is_simulated_in_the_block() -> None:
     pytest.importorskip("Box2D")
     found = findings("LunarLanderContinuous-v3")

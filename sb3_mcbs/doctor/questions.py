@@ -34,12 +34,13 @@ def describe(env: gym.Env) -> dict[str, Any]:
     """What is it?
 
     :param env: the environment.
-    :return: its class, its spaces, and the time that passes in a step if it says so.
+    :return: its class, its spaces, SB3's policy for its observations, and the time that a step takes.
     """
     return {
         "class": type(env.unwrapped).__name__,
         "observations": _in_words(env.observation_space),
         "actions": _in_words(env.action_space),
+        "policy": policy_name(env.observation_space),
         "control_period": control_period(env),
     }
 
@@ -151,18 +152,22 @@ def forward_model(wrapper: SnapshotEnvWrapper) -> dict[str, Any]:
         model.close()
 
 
+def policy_name(space: gym.Space) -> str:
+    """Which of SB3's policies is for such observations?
+
+    :param space: of the observations.
+    """
+    if isinstance(space, gym.spaces.Dict):
+        return "MultiInputPolicy"
+    return "CnnPolicy" if is_image_space(space) else "MlpPolicy"
+
+
 def untrained_agent(env: VecEnv) -> OffPolicyAlgorithm:
     """A TD3 agent to measure with, where none is given.
 
     :param env: the environment.
     """
-    space = env.observation_space
-    policy = "MlpPolicy"
-    if isinstance(space, gym.spaces.Dict):
-        policy = "MultiInputPolicy"
-    elif is_image_space(space):
-        policy = "CnnPolicy"
-    layers = {"net_arch": LAYERS}
+    policy, layers = policy_name(env.observation_space), {"net_arch": LAYERS}
     return TD3(policy, env, buffer_size=1, policy_kwargs=layers, seed=0, device="cpu")
 
 

@@ -47,6 +47,7 @@ def recipe(findings: dict[str, Any], name: str, wrappers: list[str], exact: bool
         entry |= _search(known, findings, exact, simulate)
     layers = [*wrappers, _SNAPSHOTS] if exact else wrappers
     entry = {key: value for key, value in entry.items() if key != "env_wrapper"}
+    entry["policy"] = findings["environment"]["policy"]
     if findings.get("agent", {}).get("normalize"):
         entry["normalize"] = str(findings["agent"]["normalize"])
     if layers:

@@ -151,7 +151,7 @@ def _costs(findings: dict[str, Any]) -> Iterator[str]:
         elif "too_slow" in cost:
             yield f"{start}not measured: about {cost['too_slow']:,.0f} s per decision"
         else:
-            share = "" if period is None else f"{cost['milliseconds'] / 1000 / period:.0%}"
+            share = "" if period is None else f"{cost['milliseconds'] / 1000 / period:,.0%}"
             numbers = f"{_short(cost['milliseconds']):>9} {_short(cost['steps_per_second']):>9}"
             yield f"{start}{cost['simulated_steps']:15,.0f} {numbers} {share:>18}".rstrip()
 
@@ -190,10 +190,11 @@ def _verdict(findings: dict[str, Any]) -> Iterator[str]:
 
 def _how_to_be_faster(findings: dict[str, Any]) -> str:
     if findings["snapshot"]["replays"]:
+        learn = ", or learn a model (forward_model: ensemble)"
         return (
             "A restore repeats the episode, so decisions take the longer the later they are: let the critics "
-            "alone rank the candidates (rollout_depth: 0), as below, or learn a model (forward_model: "
-            "ensemble)."
+            "alone rank the candidates (rollout_depth: 0), as below"
+            f"{learn if findings['environment']['policy'] == 'MlpPolicy' else ''}."
         )
     return (
         "Simulating takes as long as the environment's own steps: make those faster, or if it simulates with "
