@@ -1,13 +1,21 @@
 """MuJoCo's warnings are shown once."""
 
+import io
+import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import mujoco
 import pytest
 
+from sb3_mcbs.models.engines import BatchEngine
 from sb3_mcbs.snapshot import mujoco_warnings
+
+MODEL = mujoco.MjModel.from_xml_string(
+    "<mujoco><worldbody><body><joint/><geom size='1'/></body></worldbody></mujoco>"
+)
 
 
 @pytest.fixture(autouse=True)
@@ -19,25 +27,51 @@ def _as_in_a_new_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Ite
     mujoco.set_mju_user_warning(before)
 
 
-def diverge(height: float) -> None:
-    model = mujoco.MjModel.from_xml_string(
-        "<mujoco><worldbody><body><joint/><geom size='1'/></body></worldbody></mujoco>"
-    )
-    data = mujoco.MjData(model)
-    data.qpos[0], data.time = 1e20, height
-    mujoco.mj_step(model, data)
+def diverge(time: float) -> None:
+    data = mujoco.MjData(MODEL)
+    data.qpos[0], data.time = 1e20, time
+    mujoco.mj_step(MODEL, data)
 
 
 def test_each_is_shown_once(capfd: pytest.CaptureFixture[str]) -> None:
     mujoco.set_mju_user_warning(None)
     mujoco_warnings.show_warnings_once()
     for time in (0.25, 17.5):
-        gym.make("HalfCheetah-v5").close()
         diverge(time)
     errors = capfd.readouterr().err
-    assert errors.count("settotalmass") == 1
     assert errors.count("huge value in QPOS") == 1 and "Time = 0.25" in errors
-    assert Path("MUJOCO_LOG.TXT").read_text().count("WARNING") == 2
+    assert Path("MUJOCO_LOG.TXT").read_text().count("WARNING") == 1
+
+
+def test_nothing_is_said_of_the_xml_of_half_cheetah(capfd: pytest.CaptureFixture[str]) -> None:
+    mujoco.set_mju_user_warning(None)
+    mujoco_warnings.show_warnings_once()
+    gym.make("HalfCheetah-v5").close()
+    assert "settotalmass" not in capfd.readouterr().err and not Path("MUJOCO_LOG.TXT").exists()
+    mujoco.set_mju_user_warning(None)
+    gym.make("HalfCheetah-v5").close()
+    assert "settotalmass" in capfd.readouterr().err, "MuJoCo says it by itself"
+
+
+@pytest.mark.parametrize("stream", [None, io.TextIOWrapper(io.BytesIO())], ids=["none", "closed"])
+def test_a_closed_stream_does_not_end_the_process(stream: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    if stream is not None:
+        stream.close()
+    monkeypatch.setattr(sys, "stderr", stream)
+    mujoco.set_mju_user_warning(None)
+    mujoco_warnings.show_warnings_once()
+    diverge(0.25)
+    assert "huge value in QPOS" in Path("MUJOCO_LOG.TXT").read_text()
+
+
+def test_simulations_on_other_threads_warn_and_go_on() -> None:
+    mujoco.set_mju_user_warning(None)
+    mujoco_warnings.show_warnings_once()
+    engine = BatchEngine(MODEL, 16, [], 4)
+    engine.state[:] = 1e20
+    diverged = engine.step(16, 2)
+    assert diverged is not None and diverged.all()
+    assert "huge value" in Path("MUJOCO_LOG.TXT").read_text()
 
 
 def test_the_handler_of_somebody_else_stays() -> None:

@@ -1,7 +1,6 @@
 """How our algorithms get into RL Zoo: by the import hook, and explicitly."""
 
 import argparse
-import ctypes
 import importlib
 import os
 import runpy
@@ -10,10 +9,7 @@ import sys
 import types
 import warnings
 from pathlib import Path
-from typing import Any
 
-import gymnasium as gym
-import mujoco
 import pytest
 
 import _sb3_mcbs_hook as hook
@@ -55,7 +51,6 @@ def test_register_fills_rl_zoos_tables_and_can_be_repeated() -> None:
         sample = rl_zoo3.exp_manager.HYPERPARAMS_SAMPLER[name]
         assert (sample.func, sample.args) == (sampler.sample_mcbs_params, (name.removeprefix("mcbs_"),))
         assert rl_zoo3.hyperparams_opt.HYPERPARAMS_CONVERTER[name] is sampler.convert_mcbs_params
-    assert rl_zoo3.exp_manager.make_vec_env is rl_zoo3.utils.make_vec_env is registration.make_vec_env
     for module in (rl_zoo3.exp_manager, rl_zoo3.train, rl_zoo3.enjoy):
         assert module.ExperimentManager is MCBSExperimentManager
     assert MCBSExperimentManager.__base__.__module__ == "rl_zoo3.exp_manager"
@@ -98,41 +93,6 @@ def test_values_that_rl_zoo_evaluates_are_what_they_were() -> None:
     for dest, word in (("hyperparams", "gamma:high"), ("env_kwargs", "preset:strong")):
         with pytest.raises(NameError):
             stored(dest, word)
-
-
-def diverging(**kwargs: object) -> gym.Env:
-    """Make HalfCheetah, and have MuJoCo warn of something else meanwhile."""
-    model = mujoco.MjModel.from_xml_string(
-        "<mujoco><worldbody><body><joint/><geom size='1'/></body></worldbody></mujoco>"
-    )
-    data = mujoco.MjData(model)
-    data.qpos[0] = 1e20
-    mujoco.mj_step(model, data)
-    return gym.make("HalfCheetah-v5", **kwargs)
-
-
-def test_only_the_warning_of_half_cheetahs_xml_is_hidden(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    mujoco.set_mju_user_warning(None)  # dm_control sets one when it is imported
-    registration.make_vec_env(diverging, env_kwargs={"render_mode": "rgb_array"}).close()
-    errors = capfd.readouterr().err
-    assert "WARNING: Nan, Inf or huge value in QPOS" in errors and "settotalmass" not in errors
-    assert "huge value in QPOS" in (tmp_path / "MUJOCO_LOG.TXT").read_text()
-    assert mujoco.get_mju_user_warning() is None
-    seen: list[Any] = []
-    mujoco.set_mju_user_warning(seen.append)
-    try:
-        registration.make_vec_env(diverging).close()
-        assert len(seen) == 1 and "QPOS" in seen[0]
-        gym.make("HalfCheetah-v5").close()
-        assert len(seen) == 2, "what was there before is put back"
-        mujoco.set_mju_user_warning(compiled := ctypes.CFUNCTYPE(None, ctypes.c_char_p)(seen.append))
-        registration.make_vec_env(diverging).close()
-        assert b"QPOS" in seen[2] and mujoco.get_mju_user_warning() is compiled
-    finally:
-        mujoco.set_mju_user_warning(None)
 
 
 class Loaded(Exception):

@@ -10,11 +10,11 @@ from typing import Any
 
 import gymnasium as gym
 from rl_zoo3.utils import get_wrapper_class
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_mcbs.loading import load_statistics
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
-from sb3_mcbs.zoo.registration import make_vec_env
 
 #: What :func:`find_environment` reads, for the help of commands.
 ENV_HELP = "an id (HalfCheetah-v5), module:Id, or a function in a Python file (my_env.py:make)"

@@ -13,10 +13,6 @@ from functools import partial
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
-import gymnasium as gym
-from stable_baselines3.common import env_util
-from stable_baselines3.common.vec_env import VecEnv
-
 from sb3_mcbs.agents.hyperparameters import MOVED, REMOVED, SETTINGS
 from sb3_mcbs.agents.registry import SEARCHING
 from sb3_mcbs.zoo.sampler import convert_mcbs_params, sample_mcbs_params
@@ -26,8 +22,6 @@ from sb3_mcbs.zoo.tuning import TotalTrialsCallback, TrainParser
 NAMED = frozenset(
     (*SETTINGS, *MOVED, *REMOVED, "policy", "noise_type", "env_wrapper", "vec_env_wrapper", "callback")
 )
-#: MuJoCo's warning about HalfCheetah's XML, which is part of Gymnasium.
-DEPRECATION = "compiler attribute 'settotalmass' is deprecated"
 
 
 def register() -> None:
@@ -57,7 +51,6 @@ def after_import(module: ModuleType) -> None:
 
 def _add_algorithms(utils: Any) -> None:
     utils.ALGOS.update(SEARCHING)
-    utils.make_vec_env = make_vec_env
     _accept_names(utils)
 
 
@@ -91,49 +84,6 @@ def _quoted(word: str, scope: dict[str, Any]) -> str:
     return word
 
 
-def make_vec_env(env_id: Callable[..., gym.Env], *args: Any, **kwargs: Any) -> VecEnv:
-    """
-    SB3's ``make_vec_env``, without a MuJoCo warning for each HalfCheetah.
-
-    :param env_id: the callable that makes an environment, as RL Zoo passes it
-    :param args: further arguments of SB3's function
-    :param kwargs: further keyword arguments of SB3's function
-    :return: the environments
-    """
-    return env_util.make_vec_env(_without_deprecation(env_id), *args, **kwargs)
-
-
-def _without_deprecation(make: Callable[..., gym.Env]) -> Callable[..., gym.Env]:
-    hidden = DEPRECATION
-
-    # Nested functions are pickled by value, so worker processes need not import this package.
-    def make_env(**kwargs: Any) -> gym.Env:
-        import ctypes
-        import sys
-
-        import mujoco
-
-        show = mujoco.get_mju_user_warning()
-
-        def warn(message: str) -> None:
-            if hidden in message:
-                return
-            if show is not None:
-                # dm_control's handler takes bytes. MuJoCo ends the process if this function raises.
-                show(message.encode() if isinstance(show, ctypes._CFuncPtr) else message)  # type: ignore[attr-defined]
-            else:  # as MuJoCo does by itself
-                print(f"WARNING: {message}\n", file=sys.stderr)
-                mujoco.mju_writeLog("WARNING", message)
-
-        mujoco.set_mju_user_warning(warn)
-        try:
-            return make(**kwargs)
-        finally:
-            mujoco.set_mju_user_warning(show)
-
-    return make_env
-
-
 def _add_samplers(hyperparams_opt: Any) -> None:
     for name in SEARCHING:
         base = name.removeprefix("mcbs_")
@@ -148,7 +98,6 @@ def _add_manager(exp_manager: Any) -> None:
         return  # manager.py is importing rl_zoo3.exp_manager; the hook calls again when it is done
     callbacks = importlib.import_module("sb3_mcbs.zoo.callbacks")
     original = subclass.__base__
-    exp_manager.make_vec_env = make_vec_env
     exp_manager.EvalCallback = callbacks.SearchEvalCallback
     exp_manager.TrialEvalCallback = callbacks.SearchTrialEvalCallback
     exp_manager.MaxTrialsCallback = TotalTrialsCallback
