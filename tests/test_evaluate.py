@@ -14,7 +14,6 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from sb3_mcbs import MCBSTD3, SearchPolicy, load_agent
 from sb3_mcbs.zoo import evaluate
 from sb3_mcbs.zoo.environments import find_environment
-from sb3_mcbs.zoo.paths import PathError
 from tests.agent_files import save_agent
 from tests.zoo_helpers import TINY_SEARCH, zoo_train
 
@@ -99,10 +98,10 @@ def test_statistics_are_not_opened_unasked(command: Any, agent: Path) -> None:
 
 
 def test_bad_paths(command: Any, agent: Path, tmp_path: Path) -> None:
-    with pytest.raises(PathError, match="name the environment with --env"):
-        evaluate.find_subject(agent, None, ())
-    with pytest.raises(PathError, match="is not the folder of an RL Zoo run"):
-        evaluate.find_subject(tmp_path, None, ())
+    with pytest.raises(SystemExit, match="name the environment with --env"):
+        command(agent)
+    with pytest.raises(SystemExit, match="is not the folder of an RL Zoo run"):
+        command(tmp_path)
     with pytest.raises(SystemExit, match=r"There is no .*nowhere\.zip"):
         command(tmp_path / "nowhere.zip")
     with pytest.raises(SystemExit, match="Did you mean: `Pendulum`"):

@@ -8,6 +8,7 @@ from pathlib import Path
 from sb3_mcbs.doctor.child import Request
 from sb3_mcbs.doctor.isolation import examine
 from sb3_mcbs.doctor.report import block, lines, verdict
+from sb3_mcbs.zoo.arguments import add_statistics, add_wrappers, positive, whole_number
 from sb3_mcbs.zoo.environments import ENV_HELP, check_trust, statistics_beside
 
 
@@ -19,23 +20,19 @@ def _parser() -> argparse.ArgumentParser:
         "0: look-ahead is exact and fast, 1: it is slow, 2: it does not work.",
     )
     parser.add_argument("environment", metavar="ENV", help=ENV_HELP)
-    parser.add_argument(
-        "--wrapper", nargs="+", metavar="W", default=[], help="its wrappers (module.Class), innermost first"
-    )
+    add_wrappers(parser)
     parser.add_argument("--agent", type=Path, metavar="ZIP", help="a trained agent, loaded without its code")
+    add_statistics(parser)
     parser.add_argument(
-        "--vecnormalize",
-        type=Path,
-        metavar="FILE",
-        help="statistics of its observations (npz or pkl); by default those beside the agent",
-    )
-    parser.add_argument("--trusted", action="store_true", help="open statistics that are a pickle")
-    parser.add_argument(
-        "--episodes", type=int, metavar="N", default=2, help="episodes of the agent, by default 2"
+        "--episodes",
+        type=whole_number(1),
+        metavar="N",
+        default=2,
+        help="episodes of the agent, by default 2",
     )
     parser.add_argument(
         "--time-limit",
-        type=float,
+        type=positive,
         metavar="S",
         default=60.0,
         help="seconds until a stage of the examination counts as hanging, by default 60",
@@ -48,12 +45,8 @@ def main() -> None:
     """Read the command line, examine the environment and print what was found."""
     parser = _parser()
     args = parser.parse_args()
-    if args.episodes < 1:
-        parser.error(f"--episodes must be 1 or more, got {args.episodes}")
-    if args.time_limit <= 0:
-        parser.error(f"--time-limit must be above 0, got {args.time_limit:g}")
     if args.agent is not None and not args.agent.is_file():
-        parser.error(f"--agent: there is no file {args.agent}")
+        parser.error(f"--agent: {args.agent} is not a file: name the zip of an agent")
     statistics = args.vecnormalize
     if statistics is None and args.agent is not None:
         statistics = statistics_beside(args.agent)

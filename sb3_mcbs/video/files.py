@@ -1,6 +1,7 @@
 """Writes frames as a video, an animation or a strip of pictures."""
 
 import itertools
+import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -40,6 +41,9 @@ class _Writer(ABC):
     def finish(self) -> None:
         """Complete the file."""
 
+    def close(self) -> None:  # noqa: B027
+        """Let go of the file, complete or not."""
+
 
 def _import_ffmpeg() -> Any:
     try:
@@ -67,6 +71,9 @@ class _Video(_Writer):
         self._stream.send(frame.convert("RGB").tobytes())
 
     def finish(self) -> None:
+        self.close()
+
+    def close(self) -> None:
         if self._stream is not None:
             self._stream.close()
 
@@ -142,14 +149,21 @@ def check_path(path: str | Path) -> Path:
 
     :param path: of the video.
     :return: the same path.
-    :raises ValueError: if its ending is unknown, or there is no such folder.
+    :raises ValueError: if its ending is unknown, or there is no such folder or nothing can be written in it.
     :raises ImportError: if a package is missing that the format needs.
     """
     path = Path(path)
     if path.suffix.lower() not in _WRITERS:
         raise ValueError(f"{path} must end with one of {', '.join(_WRITERS)}: the ending chooses the format.")
-    if not path.absolute().parent.is_dir():
-        raise ValueError(f"There is no folder {path.absolute().parent}.")
+    folder = path.absolute().parent
+    if not folder.is_dir():
+        raise ValueError(f"There is no folder {folder}: make it, or name another file.")
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder: name a file.")
+    try:
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise ValueError(f"{folder} cannot be written to ({error.strerror}): name another folder.") from error
     if path.suffix.lower() == ".mp4":
         _import_ffmpeg()
     return path
@@ -157,7 +171,7 @@ def check_path(path: str | Path) -> Path:
 
 @contextmanager
 def open_video(path: str | Path, fps: float) -> Iterator[_Writer]:
-    """Write frames to a file. It is complete after the block.
+    """Write frames to a file. It is there when the block has ended without an error.
 
     :param path: ends with ``.mp4``, ``.gif`` or ``.png``; a PNG shows four moments, one above the other.
     :param fps: pictures per second.
@@ -165,8 +179,13 @@ def open_video(path: str | Path, fps: float) -> Iterator[_Writer]:
     :raises ImportError: if a package is missing that the format needs.
     """
     path = check_path(path)
-    writer = _WRITERS[path.suffix.lower()](path, fps)
+    part = path.with_name(f".{path.stem}.part{path.suffix}")
+    writer = _WRITERS[path.suffix.lower()](part, fps)
     try:
         yield writer
-    finally:
         writer.finish()
+        if part.exists():  # there were pictures
+            part.replace(path)
+    finally:
+        writer.close()
+        part.unlink(missing_ok=True)

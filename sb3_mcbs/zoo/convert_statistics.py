@@ -1,11 +1,11 @@
 """``sb3-mcbs convert-statistics vecnormalize.pkl out.npz --trusted``: normalisation statistics as npz."""
 
 import argparse
-import pickle
 import sys
 from pathlib import Path
 
 from sb3_mcbs.loading.normalization import save_statistics
+from sb3_mcbs.zoo.environments import unpickle_statistics
 
 
 def convert_statistics(pickle_path: str | Path, npz_path: str | Path, trusted: bool = False) -> None:
@@ -16,23 +16,15 @@ def convert_statistics(pickle_path: str | Path, npz_path: str | Path, trusted: b
     :param npz_path: the file to write, for ``sb3_mcbs.loading.normalization.load_statistics``
     :param trusted: whether the caller trusts the pickle's author
     :raises PermissionError: without ``trusted``
-    :raises ValueError: if the file is not a pickle, or its code fails
-    :raises TypeError: if the file contains something else
+    :raises ValueError: if the file is not a pickle, its code fails, or it contains something else
+    :raises TypeError: if its statistics cannot be written
     """
     if not trusted:
         raise PermissionError(
             f"{pickle_path} is a pickle: reading it runs whatever code its author put in. If you trust them, "
             "say so with --trusted (trusted=True); else convert it on a machine that has nothing to lose."
         )
-    with Path(pickle_path).open("rb") as stream:
-        try:
-            vec_normalize = pickle.load(stream)
-        except Exception as error:  # the pickle's code may raise anything
-            raise ValueError(
-                f"{pickle_path} cannot be unpickled ({type(error).__name__}: {error}). Name a file that "
-                "VecNormalize.save or RL Zoo wrote, usually vecnormalize.pkl."
-            ) from error
-    save_statistics(vec_normalize, npz_path)
+    save_statistics(unpickle_statistics(Path(pickle_path)), npz_path)
 
 
 def main() -> None:

@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+import pickle
 import sys
 import traceback
 from collections.abc import Callable, Sequence
@@ -47,8 +48,13 @@ def find_environment(name: str, wrappers: Sequence[Any] = ()) -> Callable[..., g
         ) from error
 
     def make_wrapped(**kwargs: Any) -> gym.Env:
-        env = make(**kwargs)
-        return env if wrap is None else wrap(env)
+        try:
+            env = make(**kwargs)
+            return env if wrap is None else wrap(env)
+        except NoEnvironmentError:
+            raise
+        except Exception as error:  # the environment's code may raise anything
+            raise NoEnvironmentError(f"{name} cannot be made: {in_words(error)}.") from error
 
     return make_wrapped
 
@@ -120,6 +126,25 @@ def in_words(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}{where}"
 
 
+def drawn(make: Callable[..., gym.Env]) -> Callable[..., gym.Env]:
+    """
+    :param make: from :func:`find_environment`
+    :return: makes the environment with the render mode ``rgb_array``, if it has render modes
+    """
+
+    def make_drawn(**kwargs: Any) -> gym.Env:
+        try:
+            return make(**{**kwargs, "render_mode": "rgb_array"})
+        except NoEnvironmentError as error:
+            if not isinstance(error.__cause__, TypeError):
+                raise
+            return make(
+                **kwargs
+            )  # MuJoCo's scene needs no render mode; where one is needed, the video says so
+
+    return make_drawn
+
+
 def make_searchable(make: Callable[..., gym.Env], **kwargs: Any) -> VecEnv:
     """
     Make a single vectorized environment to search in.
@@ -160,8 +185,36 @@ def normalized(env: VecEnv, statistics: Path | None, trusted: bool) -> VecEnv:
         return env
     if statistics.suffix == ".npz":
         return load_statistics(statistics, env)
-    normalizer = VecNormalize.load(str(statistics), env)
+    normalizer = unpickle_statistics(statistics)
+    shape = normalizer.observation_space.shape
+    if shape != env.observation_space.shape:
+        raise ValueError(
+            f"{statistics} has statistics of observations of shape {shape}, and the environment's have "
+            f"{env.observation_space.shape}: is it the one that the agent was trained in?"
+        )
+    normalizer.set_venv(env)
     normalizer.training = False
+    return normalizer
+
+
+def unpickle_statistics(path: Path) -> VecNormalize:
+    """
+    Read a pickle, which runs its code.
+
+    :param path: a file from ``VecNormalize.save`` or RL Zoo
+    :return: the statistics
+    :raises ValueError: if the file is not a pickle, its code fails, or it contains something else
+    """
+    with path.open("rb") as stream:
+        try:
+            normalizer = pickle.load(stream)
+        except Exception as error:  # the pickle's code may raise anything
+            raise ValueError(
+                f"{path} cannot be unpickled ({type(error).__name__}: {error}). Name a file that "
+                "VecNormalize.save or RL Zoo wrote, usually vecnormalize.pkl."
+            ) from error
+    if not isinstance(normalizer, VecNormalize):
+        raise ValueError(f"{path} has no VecNormalize in it, but a {type(normalizer).__name__}.")
     return normalizer
 
 
