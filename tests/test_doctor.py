@@ -147,7 +147,8 @@ def test_what_is_wrong_is_said(name: str, stage: str, says: str) -> None:
     ],
 )
 def test_an_unknown_environment(name: str, says: str) -> None:
-    assert says in findings(name)["problem"]
+    found = findings(name)
+    assert says in found["problem"] and "The environment cannot be made." in text(found, name)
 
 
 def test_a_file_that_is_no_python(tmp_path: Path) -> None:

@@ -1,5 +1,8 @@
 """Videos: what they show is what the search simulated. Drawing MuJoCo's scene needs OpenGL."""
 
+import errno
+import importlib.util
+import itertools
 import os
 import sys
 
@@ -7,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from PIL import Image
-from stable_baselines3 import SAC, TD3
+from stable_baselines3 import TD3
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_mcbs import SearchPolicy, SnapshotEnvWrapper
@@ -201,6 +204,63 @@ def test_episodes_to_their_end_and_what_cannot_be_recorded(pendulum, tmp_path) -
         record_episodes(tmp_path / "b.png", [Performer("two", policy.model, two)], [1])
 
 
+def test_a_video_is_whole_or_not_there(pendulum, tmp_path, monkeypatch) -> None:
+    policy = make_policy(pendulum(), beam_width=1, rollout_depth=0)
+    performer = Performer("search", policy, policy.vec_env)
+    draw, count = Panel.alone, itertools.count()
+
+    def interrupted(*args, **kwargs):
+        if next(count) == 3:
+            raise KeyboardInterrupt
+        return draw(*args, **kwargs)
+
+    monkeypatch.setattr(Panel, "alone", interrupted)
+    endings = [".gif", ".png", *([".mp4"] if importlib.util.find_spec("imageio_ffmpeg") else [])]
+    for ending in endings:
+        count = itertools.count()
+        path = tmp_path / f"a{ending}"
+        path.write_text("the one before")
+        with pytest.raises(KeyboardInterrupt):
+            record_episodes(path, [performer], [1])
+        assert list(tmp_path.iterdir()) == [path] and path.read_text() == "the one before"
+        path.unlink()
+
+
+def test_where_nothing_can_be_written(pendulum, tmp_path, monkeypatch) -> None:
+    performer = Performer("alone", make_policy(pendulum()).model, pendulum())
+    (tmp_path / "a.png").mkdir()
+    with pytest.raises(ValueError, match="is a folder: name a file"):
+        record_episodes(tmp_path / "a.png", [performer], [1])
+
+    def full(**kwargs):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("tempfile.TemporaryFile", full)
+    with pytest.raises(ValueError, match=r"cannot be written to \(No space left on device\)"):
+        record_episodes(tmp_path / "b.png", [performer], [1])
+
+
+@pytest.mark.parametrize("name", ["Pendulum-v1", "pendulum.py:make", "pendulum.py:blind"])
+def test_the_command_takes_any_environment(name, pendulum, tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    (tmp_path / "pendulum.py").write_text(
+        "import gymnasium as gym\n"
+        "def make(render_mode=None):\n    return gym.make('Pendulum-v1', render_mode=render_mode)\n"
+        "def blind():\n    return gym.make('Pendulum-v1')\n"
+    )
+    TD3("MlpPolicy", gym.make("Pendulum-v1"), seed=0, **SMALL).save(tmp_path / "agent.zip")
+    words = ["agent.zip", "--env", name, "--wrapper", "gymnasium.wrappers.FlattenObservation"]
+    args = parser().parse_args([*words, "-o", "a.png", "--steps", "2"])
+    if name == "pendulum.py:blind":
+        with pytest.raises(RenderingError, match="make it with render_mode='rgb_array'"):
+            watch(args)
+    else:
+        watch(args)
+        assert "TD3 with search: return" in capsys.readouterr().out
+    assert (tmp_path / "a.png").exists() == (name != "pendulum.py:blind")
+
+
 def test_what_is_missing_for_drawing_is_said(monkeypatch, tmp_path) -> None:
     policy = make_policy(make_vec_env(), beam_width=2)
     performer = Performer("search", policy, policy.vec_env)
@@ -221,13 +281,13 @@ def test_what_is_missing_for_drawing_is_said(monkeypatch, tmp_path) -> None:
 @needs_opengl
 def test_the_command_draws_rollouts_in_the_scene(tmp_path, capsys) -> None:
     agent = tmp_path / "agent.zip"
-    SAC("MlpPolicy", gym.make("HalfCheetah-v5"), seed=0, **SMALL).save(agent)
+    TD3("MlpPolicy", gym.make("HalfCheetah-v5"), seed=0, **SMALL).save(agent)
 
     def picture(name: str, *further: str) -> np.ndarray:
         path = tmp_path / name
         arguments = [str(agent), "--env", "HalfCheetah-v5", "-o", str(path), "--steps", "1", "--start", "2"]
         watch(parser().parse_args([*arguments, *further]))
-        assert "SAC with search: return" in capsys.readouterr().out
+        assert "TD3 with search: return" in capsys.readouterr().out
         return np.asarray(Image.open(path).convert("RGB"))[:, :560].astype(int)
 
     def count_chosen(pixels: np.ndarray) -> int:

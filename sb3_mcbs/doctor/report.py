@@ -14,6 +14,11 @@ EXACT_AND_FAST, SLOW, DOES_NOT_WORK = 0, 1, 2
 FAST = 20.0
 #: The same for training with it.
 AFFORDABLE = 100.0
+#: The verdict where look-ahead could not be tried.
+_WITHOUT = {
+    "making the environment": "The environment cannot be made.",
+    "loading the agent": "The agent cannot be used.",
+}
 _WIDTH = 80
 _LABEL = 15
 
@@ -181,8 +186,7 @@ def _verdict(findings: dict[str, Any]) -> Iterator[str]:
     elif status == SLOW:
         yield from _entry("Verdict", "Look-ahead is exact, but slow.", _how_to_be_faster(findings))
     else:
-        of_agent = findings["stage"] == "loading the agent"
-        yield from _entry("Verdict", "The agent cannot be used." if of_agent else "Look-ahead does not work.")
+        yield from _entry("Verdict", _WITHOUT.get(findings["stage"], "Look-ahead does not work."))
         yield from _entry("Problem", findings["problem"])
         if "advice" in findings:
             yield from _entry("Advice", findings["advice"])
