@@ -170,15 +170,12 @@ def check_path(path: str | Path) -> Path:
 
 
 @contextmanager
-def open_video(path: str | Path, fps: float) -> Iterator[_Writer]:
+def open_video(path: Path, fps: float) -> Iterator[_Writer]:
     """Write frames to a file. It is there when the block has ended without an error.
 
-    :param path: ends with ``.mp4``, ``.gif`` or ``.png``; a PNG shows four moments, one above the other.
+    :param path: from :func:`check_path`; a PNG shows four moments, one above the other.
     :param fps: pictures per second.
-    :raises ValueError: if the ending is unknown, or there is no such folder.
-    :raises ImportError: if a package is missing that the format needs.
     """
-    path = check_path(path)
     part = path.with_name(f".{path.stem}.part{path.suffix}")
     writer = _WRITERS[path.suffix.lower()](part, fps)
     try:

@@ -121,13 +121,11 @@ class Onlooker:
         state = self._env.snapshot(monitor=False)
         # A round that a deadline interrupted has rollouts, but no values.
         known = [rollout for rollout in rollouts if rollout.candidate < n_candidates]
-        positions = [
+        *ways, own_way = (
             replay(self._copy, state, rollout.actions, self._bodies, self._rng)
             for rollout in (*known, own[0])
-        ]
-        return [(rollout.candidate, way) for rollout, way in zip(known, positions, strict=False)], positions[
-            -1
-        ]
+        )
+        return [(rollout.candidate, way) for rollout, way in zip(known, ways, strict=True)], own_way
 
     def close(self) -> None:
         """Leave the search as it was."""

@@ -90,7 +90,7 @@ def record_episodes(
     """
     if len(performers) not in (1, 2):
         raise ValueError(f"One or two can be shown at a time, got {len(performers)}.")
-    check_path(path)
+    path = check_path(path)
     size = ALONE if len(performers) == 1 else COMPARED
     stages: list[_Stage] = []
     outcomes: list[Outcome] = []

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from sb3_mcbs.agents.faults import NonFiniteError
 from sb3_mcbs.agents.registry import ALGORITHMS
 from sb3_mcbs.models import ForwardModelError
 from sb3_mcbs.snapshot import SnapshotError
@@ -21,7 +20,6 @@ _IN_WORDS = (
     ValueError,
     SnapshotError,
     ForwardModelError,
-    NonFiniteError,
     RenderingError,
 )
 

@@ -76,7 +76,7 @@ def parser() -> argparse.ArgumentParser:
         action="extend",
         default=[],
         metavar="NAME",
-        help="bodies to follow, by default the first that moves",
+        help="bodies to follow, by default the torso, or the end of a fixed robot",
     )
     add(
         "--magnify",
