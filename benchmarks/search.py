@@ -89,9 +89,10 @@ class Decision:
     def _record(self) -> None:
         """Note the rows of every network call, and the states before every step of the batch."""
         self.simulated_steps = self.search().simulated_steps
+        functions = self.planner.functions()._replace(rollout=None)  # step by step, where one can look on
+        self.planner.functions = lambda: functions  # type: ignore[method-assign]
         if self.is_batched:
             self._record_physics()
-        functions = self.planner.functions()
         policy_rows, value_rows = [], []
 
         def noted_policy(observations: Any) -> np.ndarray:

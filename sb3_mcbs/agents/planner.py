@@ -1,9 +1,10 @@
 """Combines an agent's networks, its environments and a forward model into a search."""
 
+import logging
 import os
 import time
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
+from sb3_mcbs.agents.compiled_policy import CompiledPolicy
 from sb3_mcbs.agents.faults import InvalidDecisions, check_networks, is_finite
 from sb3_mcbs.agents.observation_pipeline import reward_normalizer
 from sb3_mcbs.agents.roots import EnvironmentStep, ExactRoots, LearnedRoots, Prediction, RootSource
@@ -35,6 +37,8 @@ from sb3_mcbs.search import (
     search,
 )
 from sb3_mcbs.types import ForwardModel, Observations, n_rows, take_rows
+
+logger = logging.getLogger("sb3_mcbs")
 
 
 class Planner:
@@ -73,6 +77,7 @@ class Planner:
         self._all_envs = range(vec_env.num_envs)
         self.recent_actions = RecentActions(self._act_dim) if recent_actions is None else recent_actions
         self._invalid_decisions = InvalidDecisions()
+        self._said = ""
         #: One per number of environments and depth, since rounds take longer with more.
         self._forecasts: defaultdict[tuple[int, int], LatencyForecast] = defaultdict(LatencyForecast)
         self._check(settings)
@@ -297,19 +302,53 @@ class Planner:
 
     def functions(self) -> PolicyFunctions:
         """The agent's current networks as functions of simulated observations."""
-        policy, gamma = policy_function(self.agent), self.agent.gamma
-        value, unscale = value_function(self.agent), unscale_function(self.agent)
+        unscale, gamma = unscale_function(self.agent), self.agent.gamma
         if self.source is None:
+            policy, value = policy_function(self.agent), value_function(self.agent)
             return PolicyFunctions(policy, value, gamma, unscale, lambda rewards: rewards, self._act_dim)
-        view = self.source.view
+        view, compiled = self.source.view, self.compiled_policy()
+        if compiled is None:
+            return self._plain_functions(unscale)
+        return PolicyFunctions(
+            compiled.policy,
+            compiled.value,
+            gamma,
+            unscale,
+            view.scale_reward,
+            self._act_dim,
+            compiled.rollout,
+        )
+
+    def compiled_policy(self, target: bool = False) -> CompiledPolicy | None:
+        """The agent's current networks in compiled code; ``None`` where that does not cover them.
+
+        :param target: the target actor, if there is one.
+        """
+        assert self.source is not None
+        try:
+            compiled = CompiledPolicy(self.agent, self.source.model, self.source.view, target)
+        except TypeError as reason:
+            self._say(f"Rollouts go step by step: {reason}.")
+            return None
+        self._say("Rollouts are compiled.")
+        return compiled
+
+    def _plain_functions(self, unscale: Callable[[np.ndarray], np.ndarray]) -> PolicyFunctions:
+        assert self.source is not None
+        policy, value, view = policy_function(self.agent), value_function(self.agent), self.source.view
         return PolicyFunctions(
             policy=lambda observations: policy(view.observe(observations)),
             value=lambda observations, actions: value(view.observe(observations), actions),
-            gamma=gamma,
+            gamma=self.agent.gamma,
             unscale_action=unscale,
             scale_reward=view.scale_reward,
             act_dim=self._act_dim,
         )
+
+    def _say(self, message: str) -> None:
+        if message != self._said:
+            self._said = message
+            logger.info(message)
 
     def unscale(self, actions: np.ndarray) -> np.ndarray:
         """Turn scaled actions into actions of the environment.

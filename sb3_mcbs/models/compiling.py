@@ -53,8 +53,11 @@ def specialize(function: Callable[..., Any], name: str, **inserted: Any) -> Call
     copy.__qualname__ = f"{function.__name__}-{name}-{fingerprint(copy)}"
     try:
         result: Callable[..., Any] = numba.njit(cache=True, **OPTIONS)(copy)
-    except RuntimeError as reason:  # no folder can be written
-        _say_once(f"Compiled code is not kept, and is compiled again in every process: {reason}")
+    except RuntimeError:
+        _say_once(
+            "Compiled code is not kept, and is compiled again in every process: no cache folder can be "
+            "written. NUMBA_CACHE_DIR can name one."
+        )
         result = numba.njit(**OPTIONS)(copy)
     return result
 

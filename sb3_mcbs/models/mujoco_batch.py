@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
+from sb3_mcbs.models.compiled_rollout import RolloutRows, short_horizon
 from sb3_mcbs.models.compiled_rows import Rows, step_rows
 from sb3_mcbs.models.environments import Environments
 from sb3_mcbs.models.families import family_of
@@ -25,7 +26,7 @@ from sb3_mcbs.models.recognition import (
 )
 from sb3_mcbs.models.simulator import Simulator
 from sb3_mcbs.models.workers import WorkerError
-from sb3_mcbs.types import ForwardModel, ForwardModelError, Transition
+from sb3_mcbs.types import ForwardModel, ForwardModelError, PolicyArrays, PolicyRollouts, Transition
 
 # Inherited from the parent of a forked process. Freeing one would wait for threads that do not exist.
 _OF_THE_PARENT: list[Simulator] = []
@@ -178,6 +179,59 @@ class MujocoBatchModel(ForwardModel):
             self._ended |= terminated
             valid = ~self._diverged
         return Transition(observations, rewards, terminated, valid)
+
+    def roll_out(
+        self,
+        roots: Sequence[Any],
+        index: np.ndarray,
+        policy: PolicyArrays,
+        actions: np.ndarray,
+        noise: np.ndarray,
+        n_shared: int,
+        bootstraps: bool = True,
+    ) -> PolicyRollouts:
+        """Roll a policy out, through all depths at once. The rows of :meth:`set_roots` are left as they are.
+
+        :param roots: from :meth:`read_roots`.
+        :param index: ``[candidates]`` integers into ``roots``.
+        :param policy: the actor and what lies between it and the environment.
+        :param actions: ``[candidates, act_dim]`` float32, the first ones, scaled to [-1, 1].
+        :param noise: ``[horizon, candidates, sim, act_dim]`` float32, added to the policy's actions after
+            each step. The first ``n_shared - 1`` are the same for all simulations of a candidate.
+        :param n_shared: steps that all simulations of a candidate share.
+        :param bootstraps: whether the returns contain the critics' values of the ends.
+        :return: the rollouts.
+        """
+        horizon, n_candidates, n_sim, act_dim = noise.shape
+        n_rows = n_candidates * n_sim
+        states, kept = self.split_roots(roots, np.repeat(index, n_sim))
+        rows = RolloutRows(
+            states,
+            kept,
+            np.repeat(actions, n_sim, axis=0),
+            np.ascontiguousarray(noise.reshape(horizon, n_rows, act_dim)),
+            returns=np.zeros(n_rows),
+            valid=np.ones(n_rows, dtype=bool),
+            terminated=np.zeros(n_rows, dtype=bool),
+            lengths=np.zeros(n_rows, dtype=np.int64),
+            observations=np.zeros((n_rows, self._obs_dim)),
+            first_observations=np.zeros((n_candidates, self._obs_dim)),
+            first_rewards=np.zeros(n_candidates),
+            n_steps=np.zeros(n_candidates, dtype=np.int64),
+        )
+        self.simulator.run(short_horizon, n_candidates, policy, rows, n_shared, bootstraps)
+        shape = n_candidates, n_sim
+        return PolicyRollouts(
+            rows.returns.reshape(shape),
+            rows.valid.reshape(shape),
+            rows.terminated.reshape(shape),
+            rows.lengths.reshape(shape),
+            rows.observations.reshape(*shape, self._obs_dim),
+            rows.actions.reshape(*shape, act_dim),
+            rows.first_observations,
+            rows.first_rewards,
+            int(rows.n_steps.sum()),
+        )
 
     def _check(self) -> None:
         """Compare with copies of the real environments on random transitions.
