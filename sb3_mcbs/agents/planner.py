@@ -61,6 +61,9 @@ class Planner:
         dynamics.
     """
 
+    #: The last line of the log about rollouts.
+    _said = ""
+
     def __init__(
         self,
         agent: OffPolicyAlgorithm,
@@ -77,7 +80,6 @@ class Planner:
         self._all_envs = range(vec_env.num_envs)
         self.recent_actions = RecentActions(self._act_dim) if recent_actions is None else recent_actions
         self._invalid_decisions = InvalidDecisions()
-        self._said = ""
         #: One per number of environments and depth, since rounds take longer with more.
         self._forecasts: defaultdict[tuple[int, int], LatencyForecast] = defaultdict(LatencyForecast)
         self._check(settings)
