@@ -91,6 +91,13 @@ def test_roots_of_several_environments_and_a_subset() -> None:
     np.testing.assert_array_equal(found.observations[2], envs[0].step(actions[2])[0])
 
 
+def test_there_may_be_no_rows() -> None:
+    env = cheetah()
+    model = MujocoBatchModel(LocalEnvironments([env]), n_threads=2)
+    start(model, 0)
+    assert model.step(np.zeros((0, 6), dtype=np.float32)).observations.shape == (0, 17)
+
+
 def test_an_old_root_stays_good() -> None:
     env = cheetah()
     model = MujocoBatchModel(LocalEnvironments([env]), n_threads=1)

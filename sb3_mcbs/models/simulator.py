@@ -71,7 +71,7 @@ class Simulator:
             self._compiled[name] = self._specialize(loop)
             with announced():
                 self._compiled[name](*self._share(0), *arguments, 0, 0)
-        function, n_shares = self._compiled[name], min(len(self._simulations), n_rows)
+        function, n_shares = self._compiled[name], max(1, min(len(self._simulations), n_rows))
         ends = [n_rows * (number + 1) // n_shares for number in range(n_shares)]
         others = []
         for number in range(1, n_shares):
