@@ -4,9 +4,10 @@ An HTML comment before a block of code, which readers do not see, says how it is
 
 - ``<!-- test: slow -->``: with the slow tests; then so is the whole page;
 - ``<!-- test: 100_000 = 300; 10_000 = 50 -->``: with other numbers;
-- ``<!-- test: skip, it needs a database -->``: not at all.
+- ``<!-- test: skip, it needs a database -->``: not at all;
+- ``<!-- test setup``, code, ``-->``: after that code.
 
-The blocks of a page are run one after another in one module.
+The blocks of a page are run one after another in one module. Agents of the hub are replaced by untrained ones.
 """
 
 import argparse
@@ -22,6 +23,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import NamedTuple
 
+import huggingface_hub
 import pytest
 import yaml
 from markdown_it import MarkdownIt
@@ -66,8 +68,13 @@ def blocks_of(path: Path, *languages: str) -> list[Block]:
         if token.type == "fence" and token.info.strip() in languages:
             assert token.map is not None
             found.append(Block(token.info.strip(), token.content, note, token.map[0] + 1))
-        comment = re.fullmatch(r"<!-- test: (.*) -->\s*", token.content, flags=re.DOTALL)
-        note = comment[1] if token.type == "html_block" and comment is not None else ""
+        comment = re.fullmatch(r"<!-- test(: | setup\n)(.*?)( ?-->)\s*", token.content, flags=re.DOTALL)
+        note = ""
+        if token.type == "html_block" and comment is not None and token.map is not None:
+            if comment[1] == ": ":
+                note = comment[2]
+            elif "python" in languages:
+                found.append(Block("python", comment[2], "", token.map[0] + 1))
     return found
 
 
@@ -90,11 +97,19 @@ def nothing_stays_registered(own_adapters: None, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(families, "_FAMILIES", dict(families._FAMILIES))
 
 
+def untrained_agent(repo: str, filename: str) -> str:
+    """Write the file of an untrained agent in place of one from the hub."""
+    algo, _, env_id = repo.removeprefix("sb3/").partition("-")
+    ALGORITHMS[algo]("MlpPolicy", env_id.replace("-v3", "-v4"), buffer_size=10, device="cpu").save(filename)
+    return filename
+
+
 @pytest.mark.parametrize("path", pages_with("python"))
 def test_the_code_of_a_page_runs(
     path: Path, tmp_path: Path, nothing_stays_registered: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(huggingface_hub, "hf_hub_download", untrained_agent)
     module = types.ModuleType(re.sub(r"\W", "_", f"page_{name_of(path)}"))
     monkeypatch.setitem(sys.modules, module.__name__, module)
     for block in blocks_of(path, "python"):
@@ -146,6 +161,7 @@ def test_commands_have_the_arguments_that_a_page_gives_them(
             assert words[1] in targets, words
             continue
         module = words[2] if words[0].startswith("python") else ""
+        module = module.replace("rl_zoo3.train", "sb3_mcbs.zoo.train")  # which needs no hook
         monkeypatch.setattr(sys, "argv", ["sb3-mcbs", *words[1:]] if not module else [module, *words[3:]])
         with pytest.raises(Parsed):
             runpy.run_module(module, run_name="__main__") if module else cli.main()
