@@ -3,11 +3,13 @@
 An HTML comment before a block of code, which readers do not see, says how it is tested:
 
 - ``<!-- test: slow -->``: with the slow tests; then so is the whole page;
-- ``<!-- test: 100_000 = 300; 10_000 = 50 -->``: with other numbers;
+- ``<!-- test: 100_000 -> 300; 10_000 -> 50 -->``: with other numbers;
+- ``<!-- test: needs pybullet -->``: where that module is installed;
 - ``<!-- test: skip, it needs a database -->``: not at all;
 - ``<!-- test setup``, code, ``-->``: after that code.
 
-The blocks of a page are run one after another in one module. Agents of the hub are replaced by untrained ones.
+The blocks of a page are run one after another in one module. Agents of the hub are replaced by untrained
+ones.
 """
 
 import argparse
@@ -20,6 +22,7 @@ import sys
 import types
 from collections.abc import Iterator
 from dataclasses import fields
+from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
@@ -55,11 +58,16 @@ class Block(NamedTuple):
     def code_to_run(self) -> str:
         code = self.code
         for change in self.note.split(";"):
-            if "=" in change:
-                old, new = change.split("=")
+            if "->" in change:
+                old, new = change.split("->")
                 assert old.strip() in code, f"line {self.line}: there is no {old.strip()} to replace"
                 code = code.replace(old.strip(), new.strip())
         return "\n" * self.line + code  # the line numbers of tracebacks are the page's
+
+    @property
+    def runs(self) -> bool:
+        needed = re.match(r"needs (\w+)", self.note)
+        return not self.note.startswith("skip") and (needed is None or find_spec(needed[1]) is not None)
 
 
 def blocks_of(path: Path, *languages: str) -> list[Block]:
@@ -113,7 +121,7 @@ def test_the_code_of_a_page_runs(
     module = types.ModuleType(re.sub(r"\W", "_", f"page_{name_of(path)}"))
     monkeypatch.setitem(sys.modules, module.__name__, module)
     for block in blocks_of(path, "python"):
-        if not block.note.startswith("skip"):
+        if block.runs:
             exec(compile(block.code_to_run, str(path), "exec"), vars(module))
 
 
@@ -207,7 +215,9 @@ def texts_of_the_code() -> str:
 
 def test_messages_are_those_of_the_code() -> None:
     text = texts_of_the_code()
-    messages = re.findall(r"^#+ `(.*)`$", (DOCS / "errors.md").read_text(encoding="utf-8"), flags=re.MULTILINE)
+    messages = re.findall(
+        r"^#+ `(.*)`$", (DOCS / "errors.md").read_text(encoding="utf-8"), flags=re.MULTILINE
+    )
     assert len(messages) > 20
     for message in messages:
         for part in message.split("..."):
@@ -219,8 +229,12 @@ def table_of(heading: str) -> dict[str, list[str]]:
     text = (DOCS / "settings.md").read_text(encoding="utf-8")
     section = re.split(r"^## ", text.partition(f"\n## {heading}\n")[2], flags=re.MULTILINE)[0]
     rows = [line.strip("|").split("|") for line in section.splitlines() if line.startswith("| `")]
-    return {ast.literal_eval(name.strip().strip("`")) if '"' in name else name.strip().strip("`"):
-            [cell.strip() for cell in rest] for name, *rest in rows}
+    return {
+        ast.literal_eval(name.strip().strip("`")) if '"' in name else name.strip().strip("`"): [
+            cell.strip() for cell in rest
+        ]
+        for name, *rest in rows
+    }
 
 
 def defaults_of(table: dict[str, list[str]]) -> dict[str, object]:
@@ -232,7 +246,9 @@ def known_by(table: dict[str, list[str]], choice: str) -> set[str]:
 
 
 def field_defaults(*classes: type) -> dict[str, object]:
-    return {field.name: field.default for cls in classes for field in fields(cls) if field.name in cls.in_group()}
+    return {
+        field.name: field.default for cls in classes for field in fields(cls) if field.name in cls.in_group()
+    }
 
 
 def test_the_page_of_settings_has_all_with_their_defaults() -> None:
