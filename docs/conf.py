@@ -3,6 +3,7 @@
 import re
 
 from sphinx.application import Sphinx
+from sphinx.util.inspect import signature, stringify_signature
 
 import sb3_mcbs
 
@@ -43,5 +44,22 @@ def follow_links(_app: Sphinx, name: str, source: list[str]) -> None:
         source[0] = re.sub(r"\[([^\]]*)\]\(\.\./[\w/]+\)", r"\1", source[0])
 
 
+def own_signature(
+    _app: Sphinx,
+    what: str,
+    _name: str,
+    documented: object,
+    _options: object,
+    found: str | None,
+    returned: str | None,
+) -> tuple[str | None, str | None]:
+    """Show the parameters of a class's constructor also where ``__new__`` takes anything."""
+    if what == "class" and found == "(*args, **kwargs)":
+        found = stringify_signature(signature(documented.__init__, bound_method=True), show_annotation=False)
+        returned = None
+    return found, returned
+
+
 def setup(app: Sphinx) -> None:
     app.connect("source-read", follow_links)
+    app.connect("autodoc-process-signature", own_signature)

@@ -14,6 +14,7 @@ ones.
 
 import argparse
 import ast
+import importlib
 import inspect
 import re
 import runpy
@@ -31,6 +32,7 @@ import pytest
 import yaml
 from markdown_it import MarkdownIt
 
+import sb3_mcbs
 from sb3_mcbs import MCBS, ExactCheckpointCallback, SearchPolicy, SnapshotEnvWrapper, cli
 from sb3_mcbs.agents import EnsembleSettings, ScheduleSettings
 from sb3_mcbs.agents.hyperparameters import SETTINGS
@@ -292,3 +294,17 @@ def test_the_page_of_settings_has_defaults_of_other_objects() -> None:
         assert {name: parameters[name].default for name in theirs} == {
             name: default for name, default in defaults_of(table).items() if name in theirs
         }
+
+
+def test_the_api_pages_have_all_public_names() -> None:
+    pages = {path.stem: path.read_text(encoding="utf-8") for path in (DOCS / "api").glob("*.rst")}
+    named = set(
+        re.findall(r"^\.\. \w+:: sb3_mcbs\.(?:\w+\.)?(\w+)$", "\n".join(pages.values()), flags=re.MULTILINE)
+    )
+    assert named >= set(sb3_mcbs.__all__) - {"__version__"}
+    for name in ("agents", "checkpoints", "experiments", "loading", "models", "search", "snapshot", "zoo"):
+        assert f".. automodule:: sb3_mcbs.{name}\n   :members:" in pages[name]
+        left_out = re.search(r":exclude-members: (.*)", pages[name])
+        assert left_out is None or set(left_out[1].split(", ")) <= named
+        public = importlib.import_module(f"sb3_mcbs.{name}").__all__
+        assert set(public) >= (set(left_out[1].split(", ")) - set(sb3_mcbs.__all__) if left_out else set())
