@@ -20,7 +20,7 @@ $(BIN)/python:
 
 # The hook that RL Zoo needs is written at installation, so a change to it installs again.
 $(STAMP): $(BIN)/python pyproject.toml setup.cfg constraints.txt _sb3_mcbs_build.py _sb3_mcbs_hook.py
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e ".[dev,docs,plots,box2d,tuning,ray,report]"
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e ".[dev,docs,plots,box2d,tuning,ray,report,video]"
 	touch $@
 
 install: $(STAMP)

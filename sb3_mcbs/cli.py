@@ -12,6 +12,7 @@ COMMANDS = {
         "sb3_mcbs.experiments.report.command",
         "a page with curves and numbers of all runs of a folder",
     ),
+    "watch": ("sb3_mcbs.zoo.watch", "a video of an agent and of what its search looks at"),
     "convert-statistics": ("sb3_mcbs.zoo.convert_statistics", "write a trusted vecnormalize.pkl as npz"),
 }
 

@@ -122,6 +122,7 @@ SHIPPED = {
     "ablation": 18,
     "ablation-frozen": 66,
     "search-training": 55,
+    "crossq": 25,
     "saturation": 20,
     "learned-model": 6,
 }
@@ -140,7 +141,7 @@ def test_shipped_specs(name: str, n_runs: int, tmp_path: Path, monkeypatch: pyte
 def test_every_shipped_spec_is_tested_and_offered() -> None:
     assert {path.stem for path in SPECS.glob("*.yml")} == set(SHIPPED)
     with pytest.raises(
-        SpecError, match="no shipped spec of this name; shipped are ablation, ablation-frozen, evid"
+        SpecError, match="no shipped spec of this name; shipped are ablation, ablation-frozen, crossq"
     ):
         read_spec("smok")
 

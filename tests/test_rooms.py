@@ -18,7 +18,8 @@ MAY_IMPORT = {
     "agents": ["types", "snapshot", "models", "search", "networks"],
     "loading": ["types", "snapshot", "models", "search", "networks", "agents"],
     "checkpoints": ["types", "snapshot", "models", "search", "networks", "agents"],
-    "zoo": ["types", "snapshot", "models", "search", "networks", "agents", "loading", "checkpoints"],
+    "video": ["types", "snapshot", "models", "search", "networks", "agents"],
+    "zoo": ["types", "snapshot", "models", "search", "networks", "agents", "loading", "checkpoints", "video"],
 }
 MAY_IMPORT["experiments"] = [*MAY_IMPORT["zoo"], "zoo"]
 MAY_IMPORT["cli"] = [*MAY_IMPORT["experiments"], "experiments"]

@@ -1,4 +1,4 @@
-"""Draws the scheme of one decision: ``python docs/images/decision.py`` writes decision.png."""
+"""Draws the scheme of one decision: ``python docs/images/scheme.py`` writes scheme.png."""
 
 from pathlib import Path
 
