@@ -302,7 +302,17 @@ def test_the_api_pages_have_all_public_names() -> None:
         re.findall(r"^\.\. \w+:: sb3_mcbs\.(?:\w+\.)?(\w+)$", "\n".join(pages.values()), flags=re.MULTILINE)
     )
     assert named >= set(sb3_mcbs.__all__) - {"__version__"}
-    for name in ("agents", "checkpoints", "experiments", "loading", "models", "search", "snapshot", "zoo"):
+    for name in (
+        "agents",
+        "checkpoints",
+        "experiments",
+        "loading",
+        "models",
+        "search",
+        "snapshot",
+        "video",
+        "zoo",
+    ):
         assert f".. automodule:: sb3_mcbs.{name}\n   :members:" in pages[name]
         left_out = re.search(r":exclude-members: (.*)", pages[name])
         assert left_out is None or set(left_out[1].split(", ")) <= named

@@ -14,7 +14,7 @@ COLOUR, CHOSEN, SECOND = "#7a7a7a", "#0b3c8c", "#e0a100"
 
 
 def main() -> None:
-    figure, axes = plt.subplots(figsize=(9, 3.9), layout="constrained")
+    figure, axes = plt.subplots(figsize=(7.2, 3.6), layout="constrained")
     steps = np.arange(STEPS + 1)
     best = int((REWARDS + CRITICS).argmax())
     for index, (height, reward, value) in enumerate(zip(HEIGHTS, REWARDS, CRITICS, strict=True)):
@@ -30,10 +30,10 @@ def main() -> None:
     axes.annotate("state", (0, 0), (-12, 0), textcoords="offset points", ha="right", va="center")
     top = HEIGHTS[0] + 0.7
     for place, text in (
-        (0.55, "1. candidates around\nthe policy's action"),
-        (2.2, "2. rollouts in exact\ncopies of the simulator"),
-        (BARS + 0.45, "3. rewards ..."),
-        (BARS + 1.9, "4. ... and what\nthe critics expect"),
+        (0.55, "1. candidates"),
+        (2.2, "2. rollouts"),
+        (BARS + 0.45, "3. rewards"),
+        (BARS + 1.9, "4. critics"),
     ):
         axes.annotate(text, (place, top), ha="center", va="bottom")
     axes.set(xlim=(-0.7, 8), ylim=(HEIGHTS[-1] - 0.5, top + 0.9))
