@@ -9,11 +9,15 @@ from sb3_mcbs.loading import AgentFileError, load_agent, load_statistics, save_s
 from sb3_mcbs.models import WorkerError
 from sb3_mcbs.search import BeamSettings, CEMSettings, SearchSettings, TreeSettings
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
+from sb3_mcbs.snapshot.mujoco_warnings import show_warnings_once
 
 try:
     __version__ = version("sb3-mcbs")
 except PackageNotFoundError:  # a checkout that was not installed
     __version__ = "0+unknown"
+
+show_warnings_once()
+del show_warnings_once
 
 __all__ = [
     "MCBS",

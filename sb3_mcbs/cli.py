@@ -8,6 +8,8 @@ COMMANDS = {
     "experiment": ("sb3_mcbs.experiments.command", "train all runs of a spec, or go on with them"),
     "resume": ("sb3_mcbs.zoo.resume", "continue a run from its exact checkpoints"),
     "repeat": ("sb3_mcbs.zoo.repeat", "repeat a run from its folder"),
+    "doctor": ("sb3_mcbs.doctor.command", "whether look-ahead works for an environment, and its cost"),
+    "evaluate": ("sb3_mcbs.zoo.evaluate", "an agent's returns, actor alone and with search"),
     "report": (
         "sb3_mcbs.experiments.report.command",
         "a page with curves and numbers of all runs of a folder",

@@ -52,6 +52,7 @@ class ForwardModel(ABC):
         search then simulates the first step of a candidate once for all its simulations.
     :ivar kind: the backend, ``"mujoco"``, ``"pool"`` or ``"ensemble"``; what ``forward_model=`` asks for.
     :ivar description: one line for a log: which backend, and why if it was chosen by itself.
+    :ivar why_not_faster: why "auto" could not take a faster model; "" if this is the fastest.
     :ivar first_error: traceback of the first error that an environment raised in a simulation; "" for none.
     """
 
@@ -59,6 +60,7 @@ class ForwardModel(ABC):
     kind: str
     description: str
     first_error: str = ""
+    why_not_faster: str = ""
 
     @property
     @abstractmethod

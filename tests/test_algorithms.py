@@ -6,7 +6,7 @@ from typing import get_type_hints
 
 import pytest
 
-from sb3_mcbs import MCBS, MCBSSAC
+from sb3_mcbs import MCBS, MCBSSAC, MCBSCrossQ
 from sb3_mcbs.agents import EnsembleSettings, ScheduleSettings
 from sb3_mcbs.agents.hyperparameters import SETTINGS
 from sb3_mcbs.agents.value_expansion import ValueExpansionSettings
@@ -20,7 +20,7 @@ OF_PRESETS = {"beam_width", "rollout_depth", "n_simulations", "beam_noise", "str
 
 def keywords(cls) -> list[str]:
     """The parameters that are not SB3's."""
-    return [*SETTINGS, *(["fast_update"] if issubclass(cls, FastUpdate) else [])]
+    return [*SETTINGS, *(["fast_update"] if issubclass(cls, FastUpdate | MCBSCrossQ) else [])]
 
 
 @pytest.mark.parametrize("cls", SEARCHING)

@@ -155,6 +155,8 @@ def commands_of(path: Path) -> Iterator[list[str]]:
     """Commands of this package, of RL Zoo and of the Makefile in a page, as words."""
     for block in blocks_of(path, "bash", "console"):
         lines = [] if block.note.startswith("skip") else block.code.replace("\\\n", " ").splitlines()
+        if any(line.startswith("$ ") for line in lines):  # the others are what the commands print
+            lines = [line for line in lines if line.startswith("$ ")]
         for line in lines:
             if found := COMMAND.search(line):
                 text = re.sub(r"\$\w+|\$\{\w+\}", "1", found[0])

@@ -15,10 +15,10 @@ from rich.console import Console
 from stable_baselines3 import TD3 as TD3Agent
 from stable_baselines3.common.env_util import make_vec_env
 
+from sb3_mcbs.agents.episodes import play
 from sb3_mcbs.experiments import command, expand, read_spec
 from sb3_mcbs.experiments.display import Display
 from sb3_mcbs.experiments.engine import ATTEMPTS, Engine
-from sb3_mcbs.experiments.evaluation import play
 from sb3_mcbs.experiments.process import Process
 from sb3_mcbs.experiments.results import ResultsError, RunFolder, prepare
 from tests.experiment_helpers import (
@@ -105,7 +105,7 @@ def test_a_trained_agent_alone_and_with_search(undisturbed: Path, tmp_path: Path
         for folder in (folder_of(tmp_path / "results", f"{name}_td3_0") for name in ("actor", "search"))
     )
     env = make_vec_env("Pendulum-v1")
-    expected = [play(TD3Agent.load(agent), env, seed, True)[0] for seed in (10_000, 10_001)]
+    expected = [play(TD3Agent.load(agent), env, seed).total for seed in (10_000, 10_001)]
     assert alone["results"].tolist() == [expected]
     assert alone["seeds"].tolist() == searched["seeds"].tolist() == [10_000, 10_001]
     assert (alone["simulated_steps"], searched["simulated_steps"]) == ([0], [2 * 2 * 200])

@@ -155,9 +155,16 @@ def test_a_dead_unit_has_no_gradient():
     assert th.isfinite(x.grad).all() and x.grad[:, 1].any()
 
 
-def test_mcbs_crossq_uses_fused_batch_renormalization():
-    layers = [layer for layer in agent_of(MCBSCrossQ).policy.modules() if isinstance(layer, BatchRenorm1d)]
-    assert {type(layer) for layer in layers} == {FusedBatchRenorm1d}
+def test_mcbs_crossq_uses_fused_batch_renormalization_unless_told_otherwise():
+    agent = agent_of(MCBSCrossQ, {"learning_starts": 5, "batch_size": 5, "search_share": 0.0})
+    for fast in (True, False, True):
+        agent.fast_update = fast
+        agent.learn(10)
+        layers = [layer for layer in agent.policy.modules() if isinstance(layer, BatchRenorm1d)]
+        assert {type(layer) for layer in layers} == {FusedBatchRenorm1d if fast else BatchRenorm1d}
+    agent.fast_update = 1
+    with pytest.raises(TypeError, match="fast_update must be True or False, got 1"):
+        agent.learn(10)
 
 
 def test_crossq_trains_as_sb3_contrib_does():

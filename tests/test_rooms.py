@@ -22,7 +22,8 @@ MAY_IMPORT = {
     "zoo": ["types", "snapshot", "models", "search", "networks", "agents", "loading", "checkpoints", "video"],
 }
 MAY_IMPORT["experiments"] = [*MAY_IMPORT["zoo"], "zoo"]
-MAY_IMPORT["cli"] = [*MAY_IMPORT["experiments"], "experiments"]
+MAY_IMPORT["doctor"] = [*MAY_IMPORT["zoo"], "zoo"]
+MAY_IMPORT["cli"] = [*MAY_IMPORT["experiments"], "experiments", "doctor"]
 
 
 def imported_rooms(path: Path) -> set[str]:

@@ -245,6 +245,20 @@ def test_logs(make_agent, tmp_path, cls):
         assert entry["search/ms_per_decision"] > 0
 
 
+def test_a_training_ends_with_one_line_of_what_it_took(make_agent, capsys):
+    agent = make_agent(verbose=1, search_share=0.0, learning_starts=10)
+    for schedule, says in (("0", "0%"), ("1", "50%")):
+        agent.search_share = float(schedule)
+        agent.learn(20, reset_num_timesteps=True)
+        lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("Trained")]
+        assert len(lines) == 1 and f"; {says} of the decisions were searched." in lines[0]
+    assert f"with {agent.n_simulated_steps:,} simulated steps" in lines[0]
+    assert "Trained for 20 environment steps" in lines[0]
+    agent.verbose = 0
+    agent.learn(5, reset_num_timesteps=False)
+    assert "Trained" not in capsys.readouterr().out
+
+
 def test_an_edited_environment_is_followed(make_agent, tmp_path):
     """Domain randomisation: the simulator's copy of the model must not stay behind."""
     agent = make_agent("HalfCheetah-v5")

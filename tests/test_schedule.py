@@ -4,6 +4,7 @@ from collections import deque
 
 import numpy as np
 import pytest
+from sb3_contrib import CrossQ
 from stable_baselines3 import TD3
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
@@ -232,7 +233,10 @@ def test_without_searched_steps_an_agent_is_the_one_without_search(make_agent, c
     agents = [
         make_agent(snapshot_vec_env("Pendulum-v1", 2), cls=each, action_noise=noise, **settings, **share)
         for each, share in (
-            (cls, dict(search_share=0.0, **(dict(fast_update=False) if issubclass(cls, TD3) else {}))),
+            (
+                cls,
+                dict(search_share=0.0, **(dict(fast_update=False) if issubclass(cls, TD3 | CrossQ) else {})),
+            ),
             (WITHOUT_SEARCH[cls], {}),
         )
     ]

@@ -1,6 +1,7 @@
-"""Logs an agent's decisions."""
+"""Logs an agent's decisions, and what a training took."""
 
-from typing import Any
+import time
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -39,3 +40,36 @@ def record_decision(agent: Any, result: SearchResult, seconds: float, settings: 
     agent.logger.record("search/decisions", agent.n_decisions)
     agent.logger.record("search/simulated_steps", agent.n_simulated_steps)
     agent.logger.record("search/invalid_rollouts", agent.n_invalid_rollouts)
+
+
+class TrainingStart(NamedTuple):
+    """An agent's counters at the beginning of a training."""
+
+    timesteps: int
+    decisions: int
+    simulated_steps: int
+    seconds: float
+
+    @classmethod
+    def of(cls, agent: Any, reset_num_timesteps: bool) -> "TrainingStart":
+        """Read them.
+
+        :param agent: an :class:`~sb3_mcbs.MCBS` agent.
+        :param reset_num_timesteps: whether its environment steps are about to be counted from 0.
+        """
+        timesteps = 0 if reset_num_timesteps else agent.num_timesteps
+        return cls(timesteps, agent.n_decisions, agent.n_simulated_steps, time.perf_counter())
+
+    def summary(self, agent: Any) -> str:
+        """What the training took, as one line.
+
+        :param agent: the same agent at the end.
+        """
+        seconds = time.perf_counter() - self.seconds
+        steps = agent.num_timesteps - self.timesteps
+        searched = (agent.n_decisions - self.decisions) / max(steps, 1)
+        return (
+            f"Trained for {steps:,} environment steps in {seconds:,.0f} s with "
+            f"{agent.n_simulated_steps - self.simulated_steps:,} simulated steps; {searched:.0%} of the "
+            "decisions were searched."
+        )

@@ -12,7 +12,7 @@ from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_mcbs.agents.decision_log import record_decision
+from sb3_mcbs.agents.decision_log import TrainingStart, record_decision
 from sb3_mcbs.agents.exploration import DrawnNoise, noise_without_search
 from sb3_mcbs.agents.faults import environment_named
 from sb3_mcbs.agents.hyperparameters import (
@@ -392,10 +392,14 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
             tb_log_name = type(self).__name__
         if self.planner is not None:
             self.planner.go_on_here()
+        begin = TrainingStart.of(self, reset_num_timesteps)
         with environment_named(self.env):
-            return super().learn(
+            super().learn(
                 total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
             )
+        if self.verbose >= 1:
+            print(begin.summary(self))
+        return self
 
     @classmethod
     def load(cls: type[SelfMCBS], path: Any, *args: Any, **kwargs: Any) -> SelfMCBS:

@@ -61,6 +61,7 @@ class MCBSCrossQ(MCBS, CrossQ):
     :param expanded_share: the share of every batch that is expanded
     :param action_noise_after_search: add ``action_noise`` to searched actions too
     :param matmul_precision: precision of the networks' float32 products (None: the process's setting)
+    :param fast_update: compute batch renormalisation with SB3-Contrib's mathematics but fewer instructions
     """
 
     def __init__(
@@ -110,13 +111,23 @@ class MCBSCrossQ(MCBS, CrossQ):
         expanded_share: float = 0.5,
         action_noise_after_search: bool = False,
         matmul_precision: str | None = None,
+        fast_update: bool = True,
     ) -> None:
         super().__init__(**sb3_arguments(locals()))
         self._init_search(locals())
+        self.fast_update = fast_update
 
         if _init_setup_model:
             self._setup_model()
 
-    def _setup_model(self) -> None:
-        super()._setup_model()
-        fuse_batch_renorm(self.policy)
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        """
+        Update the networks as CrossQ does.
+
+        :param gradient_steps: how many gradient steps to do
+        :param batch_size: transitions sampled for each
+        """
+        if not isinstance(self.fast_update, bool):
+            raise TypeError(f"fast_update must be True or False, got {self.fast_update!r}.")
+        fuse_batch_renorm(self.policy, self.fast_update)
+        super().train(gradient_steps, batch_size)

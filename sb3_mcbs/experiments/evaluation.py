@@ -2,45 +2,24 @@
 
 import json
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, sync_envs_normalization
 
 from sb3_mcbs.agents import SearchPolicy
+from sb3_mcbs.agents.episodes import play
 from sb3_mcbs.experiments.results import write
 
 #: What every ``evaluations.npz`` has: the first three as SB3's ``EvalCallback`` writes them.
 ARRAYS = ("timesteps", "results", "ep_lengths", "seeds", "simulated_steps", "seconds")
 #: Seconds between two reports of progress.
 _REPORT_EVERY = 1.0
-
-
-def play(
-    policy: Any, env: VecEnv, seed: int, deterministic: bool, callback: Callable[..., None] | None = None
-) -> tuple[float, int]:
-    """
-    Play one episode.
-
-    :param policy: what acts
-    :param env: a single environment
-    :param seed: that it is reset with
-    :param deterministic: whether actions are
-    :param callback: called after every step
-    :return: the return, and the number of steps
-    """
-    env.seed(seed)
-    returns, lengths = evaluate_policy(
-        policy, env, 1, deterministic, callback=callback, return_episode_rewards=True, warn=False
-    )
-    assert isinstance(returns, list) and isinstance(lengths, list)
-    return float(returns[0]), int(lengths[0])
 
 
 def write_evaluations(folder: Path, arrays: dict[str, Any]) -> None:
@@ -113,7 +92,7 @@ class PolicyEvaluation(BaseCallback):
         if isinstance(self.eval_env, VecNormalize):
             sync_envs_normalization(self.training_env, self.eval_env)
         episodes = [play(self.model, self.eval_env, seed, self.deterministic) for seed in self.seeds]
-        returns, lengths = [each[0] for each in episodes], [each[1] for each in episodes]
+        returns, lengths = [each.total for each in episodes], [each.length for each in episodes]
         self.timesteps.append(self.num_timesteps)
         self.results.append(returns)
         self.ep_lengths.append(lengths)

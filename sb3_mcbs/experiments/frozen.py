@@ -9,7 +9,8 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_mcbs.agents import SearchPolicy
-from sb3_mcbs.experiments.evaluation import play, write_evaluations
+from sb3_mcbs.agents.episodes import Episode, play
+from sb3_mcbs.experiments.evaluation import write_evaluations
 from sb3_mcbs.experiments.plan import Run
 from sb3_mcbs.experiments.results import RunFolder, write
 from sb3_mcbs.loading import load_agent, load_statistics
@@ -26,29 +27,23 @@ def evaluate_agent(folder: RunFolder) -> None:
     """
     run = folder.run()
     env, policy = _make_policy(run)
-    steps: list[int] = []
-
-    def count(*_: Any) -> None:
-        result = getattr(policy, "last_result", None)
-        steps.append(0 if result is None else int(result.simulated_steps))
-
     seeds = run.evaluation.seeds
-    episodes: list[tuple[float, int]] = []
+    episodes: list[Episode] = []
     started = time.perf_counter()
     for seed in seeds:
-        episodes.append(play(policy, env, seed, True, count))
-        mean = float(np.mean([each[0] for each in episodes]))
+        episodes.append(play(policy, env, seed))
+        mean = float(np.mean([each.total for each in episodes]))
         progress = {"step": len(episodes), "evaluations": len(episodes), "returns": {run.algorithm: mean}}
         write(folder.progress_file, json.dumps(progress) + "\n")
-        print(f"Episode with seed {seed}: {episodes[-1][0]:.2f} in {episodes[-1][1]} steps")
+        print(f"Episode with seed {seed}: {episodes[-1].total:.2f} in {episodes[-1].length} steps")
     write_evaluations(
         folder.training(run),
         {
             "timesteps": [0],
-            "results": [[each[0] for each in episodes]],
-            "ep_lengths": [[each[1] for each in episodes]],
+            "results": [[each.total for each in episodes]],
+            "ep_lengths": [[each.length for each in episodes]],
             "seeds": seeds,
-            "simulated_steps": [sum(steps)],
+            "simulated_steps": [sum(each.simulated_steps for each in episodes)],
             "seconds": [time.perf_counter() - started],
         },
     )

@@ -32,7 +32,7 @@ def make_forward_model(
         )
     if kind not in BACKENDS:
         raise ValueError(f"unknown forward model {kind!r}; choose one of {', '.join(map(repr, BACKENDS))}")
-    level, reason = logging.INFO, ""
+    level, why_not_faster = logging.INFO, ""
     if kind != "pool":
         try:
             batch = MujocoBatchModel(environments, n_threads)
@@ -44,8 +44,10 @@ def make_forward_model(
             # The pool is much slower, so a user should know that a familiar environment needs it.
             if not isinstance(error, NotRecognizedError) or error.notable:
                 level = logging.WARNING
-            reason = f", because the batch cannot: {error}"
+            why_not_faster = str(error)
     pool = EnvPoolModel(environments)
-    pool.description += reason
+    if why_not_faster:
+        pool.why_not_faster = why_not_faster
+        pool.description += f", because the batch cannot: {why_not_faster}"
     logger.log(level, "look-ahead: %s", pool.description)
     return pool

@@ -60,6 +60,7 @@ class BulletAdapter(ReplayAdapter):
     :param prepare: as in :class:`ReplayAdapter`.
     """
 
+    what = "PyBullet's saved state"
     not_state = frozenset({"close"})
     n_later_checks = 20
     advice = (

@@ -29,6 +29,7 @@ class PhysicsAdapter(SnapshotAdapter):
     """
 
     with_attributes = True
+    what = "dm_control's physics"
     not_state = frozenset({"_contexts_lock", "_contexts"})
 
     def capture(self, obj: Any) -> None:

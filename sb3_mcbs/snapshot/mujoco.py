@@ -199,6 +199,8 @@ class _MujocoAdapter(SnapshotAdapter):
 class MjModelAdapter(_MujocoAdapter):
     """Captures the values of a model; snapshots share them for as long as nobody edits the model."""
 
+    what = "MuJoCo's model"
+
     def _model_of(self, obj: Any) -> Any:
         return obj
 
@@ -307,6 +309,8 @@ def _unpickled(pickled: dict[str, Any], model: Any) -> Any:
 
 class MjDataAdapter(_MujocoAdapter):
     """Captures a whole ``MjData``."""
+
+    what = "MuJoCo's data"
 
     def capture(self, obj: Any) -> DataState:
         return DataState(obj, obj.model)

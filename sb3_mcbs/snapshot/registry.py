@@ -20,12 +20,14 @@ class SnapshotAdapter(ABC):
     :cvar n_later_checks: for an adapter of whole environments: from how many states, farther and farther
         from the reset, the check before the first snapshot compares steps.
     :cvar advice: what a user can do about an environment that does not pass this check.
+    :cvar what: what is captured, in words.
     """
 
     with_attributes: bool = False
     not_state: frozenset[str] = frozenset()
     n_later_checks: int = 1
     advice: str = ""
+    what: str = ""
 
     def attach(self, env: Any) -> None:  # noqa: B027
         """Prepare an environment; called when it is wrapped in ``SnapshotEnvWrapper``.

@@ -144,6 +144,7 @@ class ReplayAdapter(SnapshotAdapter):
     """
 
     with_attributes = True
+    what = "the episode's actions, which every restore repeats"
     not_state = frozenset({"reset", "step", RECORDER})
 
     def __init__(self, prepare: Callable[[Any], None] | None = None) -> None:

@@ -84,6 +84,7 @@ class InexactError(SnapshotUnsupportedError):
     def __init__(self, what: str, what_to_do: str) -> None:
         super().__init__(f"{what} {what_to_do}")
         self.what = what
+        self.what_to_do = what_to_do
 
 
 class CheckedEnvironment:
@@ -207,13 +208,15 @@ def _text(value: Any) -> Any:
         return object()
 
 
-def check_exact(checked: CheckedEnvironment, action_space: gym.Space) -> None:
+def check_exact(checked: CheckedEnvironment, action_space: gym.Space, n_later: int = 0) -> int:
     """Compare what an environment does after a restore, and in a clone, with what it did before.
 
     The environment is left somewhere; global generators are left as they were.
 
     :param checked: the environment.
     :param action_space: of the environment.
+    :param n_later: from how many states, farther and farther from the reset, steps are compared at least.
+    :return: how many steps the comparisons took.
     :raises SnapshotUnsupportedError: names what differed, and at which step.
     """
     start = time.perf_counter()
@@ -221,21 +224,22 @@ def check_exact(checked: CheckedEnvironment, action_space: gym.Space) -> None:
     name = type(layers[-1].env).__name__
     as_it_came = _fingerprint(layers)
     with globals_kept():
-        n_steps = _check_each_way(checked, layers[-1].env, action_space)
+        n_steps = _check_each_way(checked, layers[-1].env, action_space, n_later)
     # A reset may have given it more attributes, as it may have done with the next one.
     _passed.setdefault(type(layers[-1].env), set()).update((as_it_came, _fingerprint(layers)))
     seconds = time.perf_counter() - start
     logger.info("snapshots of %s were checked: exact in %d steps (%.2f s)", name, n_steps, seconds)
+    return n_steps
 
 
-def _check_each_way(checked: CheckedEnvironment, env: Any, action_space: gym.Space) -> int:
+def _check_each_way(checked: CheckedEnvironment, env: Any, action_space: gym.Space, n_later: int) -> int:
     """Check an environment, and again if its adapter knows another way to capture it.
 
     :return: how many steps the comparisons took.
     """
     adapter = find_adapter(env)
     try:
-        return _Check(checked, env, action_space, adapter).run()
+        return _Check(checked, env, action_space, adapter, n_later).run()
     except (InexactError, SnapshotMismatchError) as error:
         if adapter is None or not adapter.fall_back(env):
             if isinstance(error, InexactError):
@@ -244,18 +248,23 @@ def _check_each_way(checked: CheckedEnvironment, env: Any, action_space: gym.Spa
         first = error.what if isinstance(error, InexactError) else str(error)
         logger.info("%s It is captured another way.", first)
     try:
-        return _Check(checked, env, action_space, adapter).run()
+        return _Check(checked, env, action_space, adapter, n_later).run()
     except SnapshotError as error:
         raise SnapshotUnsupportedError(f"{first} Captured another way: {error}") from error
 
 
 class _Check:
     def __init__(
-        self, checked: CheckedEnvironment, env: Any, action_space: gym.Space, adapter: SnapshotAdapter | None
+        self,
+        checked: CheckedEnvironment,
+        env: Any,
+        action_space: gym.Space,
+        adapter: SnapshotAdapter | None,
+        n_later: int,
     ) -> None:
         self._env = checked
         self._name = type(env).__name__
-        self._n_later = 1 if adapter is None else adapter.n_later_checks
+        self._n_later = max(n_later, 1 if adapter is None else adapter.n_later_checks)
         advice = _NOT_SEEN if adapter is None else adapter.advice or _NOT_SEEN
         if adapter is None and "pybullet" in sys.modules:
             advice = f"{_USES_BULLET.format(self._name)} {advice}"

@@ -184,7 +184,7 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
         layers = self._stack.layers
         if not is_known_exact(layers, (Box2DAdapter,)) and not has_passed(layers):
             try:
-                self._check()
+                self.check()
             except SnapshotError as error:
                 if isinstance(error, CannotResetError) and self.last_observation is None:
                     return False
@@ -194,11 +194,17 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
         self._verified = True
         return True
 
-    def _check(self) -> None:
+    def check(self, n_states: int = 0) -> int:
+        """Check that snapshots of this environment are exact, also if that is known already.
+
+        :param n_states: from how many states steps are compared at least.
+        :return: how many steps were compared.
+        :raises SnapshotUnsupportedError: as :meth:`verify` does; the environment is left anywhere then.
+        """
         stack = self._stack
         with stack.bare():
             checked = CheckedEnvironment(stack, self.env, self.reset_arguments, _clone)
-            check_exact(checked, self.action_space)
+            return check_exact(checked, self.action_space, n_states)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Step the environment.
