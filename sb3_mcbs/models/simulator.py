@@ -1,6 +1,7 @@
 """Threads that run a family's compiled code, each on an ``MjData`` of its own."""
 
 import copy
+import importlib.util
 from collections import namedtuple
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -97,4 +98,15 @@ class Simulator:
         self._inserted.setdefault("transition", checked(self.family.transition))
         self._inserted.setdefault("keep", checked(self.family.keep))
         env_step = compiled(with_names(compiled_rows.env_step, self._inserted))
-        return specialize(loop, self.name, **self._inserted, env_step=env_step)
+        module = self.family.transition.__module__
+        inserted = {**self._inserted, "env_step": env_step}
+        if not _can_be_imported(module):  # code on disk refers to it
+            return compiled(with_names(loop, inserted))
+        return specialize(loop, f"{module}.{self.name}", **inserted)
+
+
+def _can_be_imported(module: str) -> bool:
+    try:
+        return importlib.util.find_spec(module) is not None
+    except (ImportError, ValueError):  # a notebook or script
+        return False
