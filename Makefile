@@ -3,13 +3,14 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.sb3-mcbs-installed
 
-.PHONY: help install train test test-slow lint format clean
+.PHONY: help install train test test-slow docs lint format clean
 .PHONY: bench-search bench-training bench-scaling bench-memory bench-deadline bench-gradient_step bench-kill bench-soak
 
 help:
 	@echo "make train      set up $(VENV), train MCBS-TD3 on HalfCheetah-v5 for 20 000 steps, report"
 	@echo "make test       set up $(VENV), run the tests on all cores (PYTEST_ARGS='-n 0': on one)"
 	@echo "make test-slow  the tests that build packages or take long"
+	@echo "make docs       the documentation as a site, in docs/_build/html"
 	@echo "make lint       ruff and mypy"
 	@echo "make format     ruff format, and what ruff check can repair"
 	@echo "make bench-search and other measurements: see docs/speed.md and docs/checkpoints.md"
@@ -19,7 +20,7 @@ $(BIN)/python:
 
 # The hook that RL Zoo needs is written at installation, so a change to it installs again.
 $(STAMP): $(BIN)/python pyproject.toml setup.cfg constraints.txt _sb3_mcbs_build.py _sb3_mcbs_hook.py
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e ".[dev,plots,box2d,tuning,ray,report,video]"
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e ".[dev,docs,plots,box2d,tuning,ray,report,video]"
 	touch $@
 
 install: $(STAMP)
@@ -33,6 +34,9 @@ test: $(STAMP)
 
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -m slow $(PYTEST_ARGS)
+
+docs: $(STAMP)
+	$(BIN)/python -m sphinx -b html -W --keep-going -q -d docs/_build/doctrees docs docs/_build/html
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
@@ -56,4 +60,4 @@ bench-training: $(STAMP) .venv-sbx/bin/python
 	$(BIN)/python -m benchmarks.training --sbx-python .venv-sbx/bin/python
 
 clean:
-	rm -rf build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache
+	rm -rf build dist docs/_build *.egg-info .pytest_cache .mypy_cache .ruff_cache

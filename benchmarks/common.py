@@ -23,7 +23,7 @@ NETWORKS = {"net_arch": [400, 300]}
 
 def machine() -> dict[str, str]:
     """Describe where this runs."""
-    packages = ("torch", "mujoco", "gymnasium", "stable-baselines3", "numpy")
+    packages = ("torch", "mujoco", "numba", "gymnasium", "stable-baselines3", "numpy")
     return {
         "processor": processor_name() or platform.machine(),
         "cores": str(usable_cores()),

@@ -31,6 +31,7 @@ from benchmarks.common import (
 )
 from benchmarks.naive import usual_search
 from sb3_mcbs import MCBSTD3
+from sb3_mcbs.models import MujocoBatchModel
 from sb3_mcbs.search import SearchResult
 
 ENVS = ("HalfCheetah-v5", "Walker2d-v5", "Swimmer-v5", "Ant-v5", "Humanoid-v5")
@@ -73,7 +74,7 @@ class Decision:
     @property
     def is_batched(self) -> bool:
         """Whether the physics is the batch's, so that it has a floor."""
-        return hasattr(self.model, "_engine")
+        return isinstance(self.model, MujocoBatchModel)
 
     def search(self) -> SearchResult:
         """One decision from the present state, which stays as it is."""
@@ -88,9 +89,10 @@ class Decision:
     def _record(self) -> None:
         """Note the rows of every network call, and the states before every step of the batch."""
         self.simulated_steps = self.search().simulated_steps
-        if self.is_batched:  # its engine has its size now
+        functions = self.planner.functions()._replace(rollout=None)  # step by step, where one can look on
+        self.planner.functions = lambda: functions  # type: ignore[method-assign]
+        if self.is_batched:
             self._record_physics()
-        functions = self.planner.functions()
         policy_rows, value_rows = [], []
 
         def noted_policy(observations: Any) -> np.ndarray:
@@ -120,17 +122,19 @@ class Decision:
 
     def _record_physics(self) -> None:
         """Note the states before every step of the batch."""
-        engine: Any = self.model._engine  # type: ignore[union-attr]
-        step = engine.step
+        model: Any = self.model
+        step = model.step
         self.states: list[np.ndarray] = []
+        self.controls: list[np.ndarray] = []
 
-        def noted_step(rows: int, n_substeps: int) -> Any:
-            self.states.append(engine.state[:rows].copy())
-            return step(rows, n_substeps)
+        def noted_step(actions: np.ndarray) -> Any:
+            self.states.append(model.states.copy())
+            self.controls.append(actions)
+            return step(actions)
 
-        engine.step = noted_step
+        model.step = noted_step
         self.search()
-        engine.step = step
+        del model.step
         self.simulated_steps = sum(len(states) for states in self.states)
         self.n_substeps = self.real.frame_skip
         most = max(len(states) for states in self.states)
@@ -140,8 +144,9 @@ class Decision:
     def physics_floor(self) -> float:
         """Seconds that the batch alone needs for the decision's steps."""
         total = 0.0
-        for states in self.states:
+        for states, controls in zip(self.states, self.controls, strict=True):
             self.batch.state[: len(states)] = states
+            self.batch.bind("ctrl")[: len(states)] = controls
             start = time.perf_counter()
             self.batch.step(self.ids[: len(states)], self.n_substeps)
             total += time.perf_counter() - start

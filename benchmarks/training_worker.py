@@ -114,7 +114,7 @@ def watch_parts(agent: Any) -> Stopwatch:
     stopwatch.watch(agent, "_sample_action", "rest of choosing actions")
     planner = getattr(agent, "planner", None)
     if planner is not None:
-        stopwatch.watch(planner.model._engine, "step", "simulate")
+        stopwatch.watch(planner.model, "step", "simulate")
         make_functions = planner.functions
 
         def timed_functions() -> Any:

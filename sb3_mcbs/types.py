@@ -45,6 +45,91 @@ class Transition(NamedTuple):
         return goes_on if self.stopped is None else goes_on & ~self.stopped
 
 
+class Layer(NamedTuple):
+    """A linear layer with what comes before and after it; its float32 arrays by their addresses.
+
+    So compiled code is the same for any number of layers, and always reads the networks' current weights.
+
+    :param gain: address of ``[n_in]``, multiplied with the input first; 0 if there is nothing.
+    :param shift: address of ``[n_in]``, added then.
+    :param weight: address of ``[n_out, n_in]``.
+    :param bias: address of ``[n_out]``.
+    :param n_in: inputs.
+    :param n_out: outputs.
+    :param activation: of the output, one of :data:`ACTIVATIONS`.
+    """
+
+    gain: int
+    shift: int
+    weight: int
+    bias: int
+    n_in: int
+    n_out: int
+    activation: int
+
+
+#: :attr:`Layer.activation` by name.
+ACTIVATIONS = {"none": 0, "relu": 1, "tanh": 2}
+
+
+class PolicyArrays(NamedTuple):
+    """An actor, its critics, and all that lies between them and the environment, as arrays.
+
+    A network is a table of its layers, a row of numbers for each :class:`Layer`. Who makes one keeps the
+    arrays behind the addresses alive.
+
+    :param actor: ``[layers, 7]`` int64, float32 observations -> actions in [-1, 1].
+    :param critics: ``[critics, layers, 7]`` int64, float32 observations and actions -> estimates.
+    :param averages: whether the value is the mean over all estimates (TQC's quantiles) or the minimum.
+    :param mean: ``[obs_dim]``, subtracted from observations; empty if they are not normalised.
+    :param deviation: ``[obs_dim]``, which then divides them.
+    :param clip: the largest absolute normalised entry.
+    :param low: ``[act_dim]`` float32, the environment's lowest actions.
+    :param half_range: ``[act_dim]`` float32, half the distance to the highest.
+    :param reward_scale: divides rewards.
+    :param reward_clip: the largest absolute scaled reward.
+    :param gamma: discount factor per environment step.
+    """
+
+    actor: np.ndarray
+    critics: np.ndarray
+    averages: bool
+    mean: np.ndarray
+    deviation: np.ndarray
+    clip: float
+    low: np.ndarray
+    half_range: np.ndarray
+    reward_scale: float
+    reward_clip: float
+    gamma: float
+
+
+class PolicyRollouts(NamedTuple):
+    """What rolling out a policy gave.
+
+    :param returns: ``[candidates, sim]``, discounted sums of scaled rewards until the last valid step, and,
+        if asked for, of the critics' value after a last step that ended nothing.
+    :param valid: ``[candidates, sim]`` bool, False where the simulation diverged.
+    :param terminated: ``[candidates, sim]`` bool.
+    :param lengths: ``[candidates, sim]``, numbers of valid steps.
+    :param observations: ``[candidates, sim, obs_dim]``, the last ones, as the environment returns them.
+    :param actions: ``[candidates, sim, act_dim]`` float32, the actions to take there.
+    :param first_observations: ``[candidates, obs_dim]``, after the first step.
+    :param first_rewards: ``[candidates]``, of the first step, not scaled.
+    :param simulated_steps: environment steps, each counted once.
+    """
+
+    returns: np.ndarray
+    valid: np.ndarray
+    terminated: np.ndarray
+    lengths: np.ndarray
+    observations: np.ndarray
+    actions: np.ndarray
+    first_observations: np.ndarray
+    first_rewards: np.ndarray
+    simulated_steps: int
+
+
 class ForwardModel(ABC):
     """Many simulated states of one or more real environments.
 

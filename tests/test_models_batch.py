@@ -2,12 +2,17 @@
 
 import csv
 import logging
+import os
 import pickle
 import random
+import subprocess
+import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import gymnasium as gym
 import mujoco
+import numba.core.caching
 import numpy as np
 import pytest
 import torch
@@ -17,13 +22,17 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_mcbs.models import (
     EnvPoolModel,
+    Family,
     ForwardModelError,
     LocalEnvironments,
     MujocoBatchModel,
     make_forward_model,
 )
-from sb3_mcbs.models.engines import INTEGRATION, BatchEngine, ThreadEngine
+from sb3_mcbs.models.compiled_rows import Rows, step_rows
+from sb3_mcbs.models.compiling import fingerprint, specialize
+from sb3_mcbs.models.libmujoco import INTEGRATION
 from sb3_mcbs.models.mujoco_batch import available_cpus
+from sb3_mcbs.models.simulator import Simulator
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 
 RNG = np.random.default_rng(0)
@@ -82,6 +91,13 @@ def test_roots_of_several_environments_and_a_subset() -> None:
     np.testing.assert_array_equal(found.observations[2], envs[0].step(actions[2])[0])
 
 
+def test_there_may_be_no_rows() -> None:
+    env = cheetah()
+    model = MujocoBatchModel(LocalEnvironments([env]), n_threads=2)
+    start(model, 0)
+    assert model.step(np.zeros((0, 6), dtype=np.float32)).observations.shape == (0, 17)
+
+
 def test_an_old_root_stays_good() -> None:
     env = cheetah()
     model = MujocoBatchModel(LocalEnvironments([env]), n_threads=1)
@@ -133,23 +149,128 @@ def test_divergence_after_the_end_does_not_invalidate_the_row() -> None:
     np.testing.assert_array_equal(model.step(np.full((2, 1), np.nan, dtype=np.float32)).valid, [True, False])
 
 
-@pytest.mark.parametrize("engine_class", [BatchEngine, ThreadEngine])
-def test_a_full_contact_buffer_is_no_divergence(engine_class: type) -> None:
+def _heights(env, kept, data, action, observation):
+    observation[:] = data.qpos[2::7]
+    return 0.0, False
+
+
+def falling_balls(memory: str) -> tuple[mujoco.MjModel, Rows, Simulator]:
+    """Two rows of many balls on a floor, with little memory for their contacts."""
     places = [(x * 0.05, y * 0.05) for x in range(6) for y in range(6)]
     balls = "".join(f'<body pos="{x} {y} .05"><freejoint/><geom size=".06"/></body>' for x, y in places)
     floor = '<geom type="plane" size="5 5 1"/>'
     model = mujoco.MjModel.from_xml_string(
-        f'<mujoco><size memory="60K"/><worldbody>{floor}{balls}</worldbody></mujoco>'
+        f'<mujoco><size memory="{memory}"/><worldbody>{floor}{balls}</worldbody></mujoco>'
     )
+    data, size = mujoco.MjData(model), mujoco.mj_stateSize(model, INTEGRATION)
+    rows = Rows(
+        np.zeros((2, size)),
+        np.zeros((2, 0)),
+        np.zeros((2, len(places))),
+        np.zeros(2),
+        *np.zeros((2, 2), dtype=bool),
+    )
+    mujoco.mj_getState(model, data, rows.states[0], INTEGRATION)
+    rows.states[1] = rows.states[0]
+    family = Family(lambda env: {}, ("qpos",), _heights)
+    return model, rows, Simulator(family, "Balls", {"dt": 0.002}, model, 1, 1)
+
+
+def test_a_full_contact_buffer_is_no_divergence() -> None:
+    model, rows, simulator = falling_balls("60K")
     data = mujoco.MjData(model)
-    engine = engine_class(model, 2, ["qpos"], 1)
-    mujoco.mj_getState(model, data, engine.state[0], INTEGRATION)
-    engine.state[1] = engine.state[0]
     mujoco.mj_step(model, data)
     assert data.warning.number[mujoco.mjtWarning.mjWARN_CONTACTFULL] > 0
-    assert engine.step(2, 1) is None
-    engine.field("qpos")[1, 0] = np.nan
-    np.testing.assert_array_equal(engine.step(2, 1), [False, True])
+    actions = np.zeros((2, 0))
+    simulator.run(step_rows, 2, rows, actions)
+    np.testing.assert_array_equal(rows.valid, [True, True])
+    assert rows.observations[0].tobytes() == data.qpos[2::7].tobytes()
+    rows.states[1, 1] = np.nan
+    simulator.run(step_rows, 2, rows, actions)
+    np.testing.assert_array_equal(rows.valid, [True, False])
+
+
+def test_an_error_of_mujoco_makes_the_row_invalid() -> None:
+    model, rows, simulator = falling_balls("30K")
+    with pytest.raises(mujoco.FatalError):
+        mujoco.mj_step(model, mujoco.MjData(model))
+    before = rows.states.copy()
+    for _ in range(3):
+        simulator.run(step_rows, 2, rows, np.zeros((2, 0)))
+        np.testing.assert_array_equal(rows.valid, [False, False])
+    np.testing.assert_array_equal(rows.states, before)
+
+
+def test_plain_python_gives_the_same_numbers_as_compiled_code(tmp_path: Path) -> None:
+    env = SnapshotEnvWrapper(gym.make("Humanoid-v5"))
+    env.reset(seed=0)
+    model = MujocoBatchModel(LocalEnvironments([env]), n_threads=2)
+    start(model, 3)
+    actions = actions_for(env, 3)
+    expected = model.step(actions)
+    roots, results = tmp_path / "roots.npy", tmp_path / "results.npy"
+    np.save(roots, model.read_roots([0])[0])
+    script = (
+        "import sys, gymnasium, numpy as np\n"
+        "from sb3_mcbs.models import LocalEnvironments, MujocoBatchModel\n"
+        "from sb3_mcbs.snapshot import SnapshotEnvWrapper\n"
+        "env = SnapshotEnvWrapper(gymnasium.make('Humanoid-v5'))\n"
+        "env.reset(seed=0)\n"
+        "model = MujocoBatchModel(LocalEnvironments([env]), n_threads=2)\n"
+        "model.set_roots([np.load(sys.argv[1])], np.zeros(3, dtype=int), None)\n"
+        "step = model.step(np.load(sys.argv[2]))\n"
+        "np.save(sys.argv[3], np.column_stack([step.observations, step.rewards]))\n"
+    )
+    given = tmp_path / "actions.npy"
+    np.save(given, actions)
+    command = [sys.executable, "-c", script, str(roots), str(given), str(results)]
+    subprocess.run(command, check=True, env={**os.environ, "NUMBA_DISABLE_JIT": "1"})
+    found = np.load(results)
+    assert found.tobytes() == np.column_stack([expected.observations, expected.rewards]).tobytes()
+
+
+@pytest.mark.slow
+def test_the_second_process_finds_the_code_on_disk(tmp_path: Path) -> None:
+    script = (
+        "import logging, gymnasium\n"
+        "logging.basicConfig(level=logging.INFO)\n"
+        "from sb3_mcbs.models import LocalEnvironments, MujocoBatchModel, compiling\n"
+        "from sb3_mcbs.snapshot import SnapshotEnvWrapper\n"
+        "env = SnapshotEnvWrapper(gymnasium.make('InvertedPendulum-v5'))\n"
+        "MujocoBatchModel(LocalEnvironments([env]), n_threads=1)\n"
+    )
+    variables = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    command = [sys.executable, "-c", script]
+    runs = [
+        subprocess.run(command, check=True, env=variables, capture_output=True, text=True) for _ in range(2)
+    ]
+    assert ["compiling the look-ahead" in run.stderr for run in runs] == [True, False]
+
+
+def _plus_something(value: int) -> int:
+    return value + something
+
+
+something = 0
+
+
+def test_without_a_folder_to_write_the_log_says_that_nothing_is_kept(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(numba.core.caching.CacheImpl, "_locator_classes", [])
+    with caplog.at_level(logging.INFO, logger="sb3_mcbs"):
+        plus_two, plus_three = (specialize(_plus_something, "test", something=n) for n in (2, 3))
+    assert (plus_two(1), plus_three(1)) == (3, 4)
+    assert caplog.text.count("Compiled code is not kept") == 1
+
+
+def test_a_changed_helper_gives_another_name_in_the_cache() -> None:
+    def calls(helper: Callable[[int], int]) -> Callable[[int], int]:
+        return lambda value: helper(value)
+
+    prints = {fingerprint(calls(helper)) for helper in (lambda v: v + 1, lambda v: v + 2, lambda v: v - 1)}
+    assert len(prints) == 3
+    assert fingerprint(calls(lambda v: v + 1)) in prints
 
 
 def test_mistakes_are_explained() -> None:
@@ -271,10 +392,10 @@ def test_wrappers_that_change_nothing_keep_the_batch(name: str) -> None:
     assert model.description.startswith("MuJoCo batch of HalfCheetahEnv")
 
 
-@pytest.mark.parametrize("difference", ["_ctrl_cost_weight", "frame_skip", "MuJoCo models", "class"])
+@pytest.mark.parametrize("difference", ["ctrl_cost_weight", "frame_skip", "MuJoCo models", "class"])
 def test_environments_that_differ_are_not_mixed(difference: str) -> None:
     first, second = gym.make("HalfCheetah-v5"), gym.make("HalfCheetah-v5")
-    if difference == "_ctrl_cost_weight":
+    if difference == "ctrl_cost_weight":
         second = gym.make("HalfCheetah-v5", ctrl_cost_weight=0.2)
     elif difference == "frame_skip":
         second = gym.make("HalfCheetah-v5", frame_skip=3)

@@ -11,13 +11,20 @@ from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv
 
 from sb3_mcbs.models import (
     Family,
-    Fields,
     ForwardModelError,
     LocalEnvironments,
     MujocoBatchModel,
     register_family,
 )
-from sb3_mcbs.models.families import known_families, scalar_power
+from sb3_mcbs.models.families import known_families
+from sb3_mcbs.models.row_arithmetic import (
+    norm,
+    numpy_sum,
+    scalar_power,
+    sum_of_squares,
+    weighted_squares,
+    widens,
+)
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "forward_models.md"
@@ -186,7 +193,27 @@ def test_the_rows_sizes_do_not_change_the_numbers() -> None:
 @pytest.mark.parametrize("exponent", [2, 3])
 def test_powers_are_those_of_scalars(exponent: int) -> None:
     values = np.random.default_rng(0).normal(size=20000)
-    assert_bitwise(scalar_power(values, exponent), [value**exponent for value in values])
+    assert_bitwise([scalar_power(value, exponent) for value in values], [value**exponent for value in values])
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("size", [1, 6, 7, 8, 9, 16, 17, 84, 127, 128, 129, 300])
+def test_sums_add_in_the_order_of_numpy(size: int, dtype: type) -> None:
+    for values in np.random.default_rng(size).normal(size=(50, size)).astype(dtype):
+        assert_bitwise(dtype(numpy_sum(values)), values.sum())
+        assert_bitwise(dtype(sum_of_squares(values)), np.sum(np.square(values)))
+
+
+def test_norms_round_as_numpys() -> None:
+    for vector in np.random.default_rng(0).normal(size=(2000, 3)):
+        assert norm(vector) == np.linalg.norm(vector)
+
+
+@pytest.mark.parametrize("weight", [0.1, np.float64(0.1), np.float32(0.1), 3])
+def test_weights_widen_as_in_numpy(weight: object) -> None:
+    for values in np.random.default_rng(0).normal(size=(200, 6)).astype(np.float32):
+        expected = np.float64(weight * np.sum(np.square(values)))
+        assert weighted_squares(weight, widens(weight), values) == expected
 
 
 def test_float64_actions_reach_the_simulator_as_they_are() -> None:
@@ -199,23 +226,6 @@ def test_float64_actions_reach_the_simulator_as_they_are() -> None:
     observation, reward, *_ = env.step(actions[1])
     assert_bitwise(transition.observations[1], observation)
     assert_bitwise(transition.rewards[1], np.float64(reward))
-
-
-@pytest.mark.parametrize(
-    ("env_id", "kwargs", "engine"),
-    [
-        ("Walker2d-v5", {}, "BatchEngine"),
-        ("Ant-v4", {}, "BatchEngine"),
-        ("Ant-v4", {"use_contact_forces": True}, "ThreadEngine"),
-        ("Ant-v5", {}, "ThreadEngine"),
-        ("Ant-v5", {"include_cfrc_ext_in_observation": False, "contact_cost_weight": 0}, "BatchEngine"),
-        ("Humanoid-v5", {"include_cfrc_ext_in_observation": False, "contact_cost_weight": 0}, "BatchEngine"),
-        ("HumanoidStandup-v5", {"include_cfrc_ext_in_observation": False}, "ThreadEngine"),
-    ],
-)
-def test_the_slower_engine_is_taken_only_for_contact_forces(env_id: str, kwargs: dict, engine: str) -> None:
-    env = SnapshotEnvWrapper(gym.make(env_id, **kwargs))
-    assert engine in MujocoBatchModel(LocalEnvironments([env]), n_threads=1).description
 
 
 def test_the_documented_family_is_taken_and_exact(capsys: pytest.CaptureFixture) -> None:
@@ -242,35 +252,48 @@ def test_the_documented_introduction_runs(capsys: pytest.CaptureFixture) -> None
     assert introduction is not None
     names: dict = {}
     exec(introduction[1], names)
-    assert capsys.readouterr().out.startswith("MuJoCo batch of HalfCheetahEnv (BatchEngine, ")
+    assert capsys.readouterr().out.startswith("MuJoCo batch of HalfCheetahEnv (compiled, ")
     assert names["second"].valid.all()
 
 
 def test_wrong_registrations_are_refused() -> None:
-    family = Family((), lambda env: Fields((), ("qpos",)), lambda env, before, after, actions: ())
+    family = Family(lambda env: {}, ("qpos",), lambda env, kept, data, action, observation: (0.0, False))
     with pytest.raises(TypeError, match="subclass of gymnasium's MujocoEnv"):
         register_family(gym.Env, family)
     with pytest.raises(TypeError, match="wants a Family for AntEnv"):
         register_family(AntEnv, lambda: None)
 
 
+def _stays(env, kept, data, action, observation):
+    observation[:] = 0.0
+    return 0.0, False
+
+
+def _writes_too_far(env, kept, data, action, observation):
+    observation[4] = 1.0
+    return 0.0, False
+
+
+def _is_only_python(env, kept, data, action, observation):
+    observation[:] = sorted(data.qpos, key=str)[0]
+    return 0.0, False
+
+
 @pytest.mark.parametrize(
-    ("attributes", "after", "message"),
+    ("constants", "fields", "transition", "message"),
     [
-        (("_nowhere",), ("qpos",), "has no _nowhere, which its family reads"),
-        ((), ("qpos",), "'_goal' is not among the attributes that the family names"),
-        (("_goal",), ("qposs",), "'qposs' is not an array of MjData"),
-        (("_goal",), ("qpos",), "the environment's observation is float64"),
+        (lambda env: {"goal": env._nowhere}, ("qpos",), _stays, "does not have: .*'_nowhere'"),
+        (lambda env: {"goal": "left"}, ("qpos",), _stays, "the constant 'goal' is a str"),
+        (lambda env: {}, ("qposs",), _stays, "'qposs' is not an array of MjData"),
+        (lambda env: {}, ("qpos",), _stays, "the observation of the model and of the environment differ"),
+        (lambda env: {}, ("qpos",), _writes_too_far, "the family of Cart failed with IndexError"),
+        (lambda env: {}, ("qpos",), _is_only_python, "the family of Cart failed with TypingError"),
     ],
 )
-def test_mistakes_in_a_family_are_explained(attributes: tuple, after: tuple, message: str) -> None:
+def test_mistakes_in_a_family_are_explained(constants, fields, transition, message: str) -> None:
     class Cart(InvertedPendulumEnv):
-        _goal = 1.0
+        """An environment that is no known one."""
 
-    def transition(env, before, after, actions):
-        rows = len(actions)
-        return np.full((rows, 3), env._goal), np.zeros(rows), np.zeros(rows, dtype=bool)
-
-    register_family(Cart, Family(attributes, lambda env: Fields((), after), transition))
+    register_family(Cart, Family(constants, fields, transition))
     with pytest.raises(ForwardModelError, match=message):
         MujocoBatchModel(LocalEnvironments([SnapshotEnvWrapper(Cart())]), n_threads=1)

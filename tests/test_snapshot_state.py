@@ -3,10 +3,8 @@
 import ctypes
 import functools
 import gc
-import pathlib
 import pickle
 import random
-import re
 import socket
 import threading
 import weakref
@@ -25,8 +23,6 @@ from sb3_mcbs.snapshot import (
     SnapshotUnsupportedError,
     register_adapter,
 )
-
-DOCS = pathlib.Path(__file__).parents[1] / "docs" / "snapshots.md"
 
 
 class Slotted:
@@ -298,14 +294,6 @@ def test_adapters_for_objects(own_adapters):
     assert clone.unwrapped.shared == ["before"] and clone.unwrapped.counter_object._total == 5
     with pytest.raises(TypeError, match="adapter"):
         register_adapter(lambda obj: True, CounterAdapter)
-
-
-def test_documented_example_runs(own_adapters):
-    blocks = re.findall(r"^```python\n(.*?)^```", DOCS.read_text(), flags=re.S | re.M)
-    assert len(blocks) >= 2
-    names = {}
-    for block in blocks:
-        exec(compile(block, str(DOCS), "exec"), names)
 
 
 class Unseen(gym.Env):

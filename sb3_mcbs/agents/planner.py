@@ -1,9 +1,10 @@
 """Combines an agent's networks, its environments and a forward model into a search."""
 
+import logging
 import os
 import time
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
+from sb3_mcbs.agents.compiled_policy import CompiledPolicy
 from sb3_mcbs.agents.faults import InvalidDecisions, check_networks, is_finite
 from sb3_mcbs.agents.observation_pipeline import reward_normalizer
 from sb3_mcbs.agents.roots import EnvironmentStep, ExactRoots, LearnedRoots, Prediction, RootSource
@@ -36,6 +38,8 @@ from sb3_mcbs.search import (
 )
 from sb3_mcbs.types import ForwardModel, Observations, n_rows, take_rows
 
+logger = logging.getLogger("sb3_mcbs")
+
 
 class Planner:
     """Searches for an agent's actions from the current states of its environments.
@@ -56,6 +60,9 @@ class Planner:
     :raises ValueError: if the settings do not fit the agent, its actions or the environments' random
         dynamics.
     """
+
+    #: The last line of the log about rollouts.
+    _said = ""
 
     def __init__(
         self,
@@ -297,19 +304,53 @@ class Planner:
 
     def functions(self) -> PolicyFunctions:
         """The agent's current networks as functions of simulated observations."""
-        policy, gamma = policy_function(self.agent), self.agent.gamma
-        value, unscale = value_function(self.agent), unscale_function(self.agent)
+        unscale, gamma = unscale_function(self.agent), self.agent.gamma
         if self.source is None:
+            policy, value = policy_function(self.agent), value_function(self.agent)
             return PolicyFunctions(policy, value, gamma, unscale, lambda rewards: rewards, self._act_dim)
-        view = self.source.view
+        view, compiled = self.source.view, self.compiled_policy()
+        if compiled is None:
+            return self._plain_functions(unscale)
+        return PolicyFunctions(
+            compiled.policy,
+            compiled.value,
+            gamma,
+            unscale,
+            view.scale_reward,
+            self._act_dim,
+            compiled.rollout,
+        )
+
+    def compiled_policy(self, target: bool = False) -> CompiledPolicy | None:
+        """The agent's current networks in compiled code; ``None`` where that does not cover them.
+
+        :param target: the target actor, if there is one.
+        """
+        assert self.source is not None
+        try:
+            compiled = CompiledPolicy(self.agent, self.source.model, self.source.view, target)
+        except TypeError as reason:
+            self._say(f"Rollouts go step by step: {reason}.")
+            return None
+        self._say("Rollouts are compiled.")
+        return compiled
+
+    def _plain_functions(self, unscale: Callable[[np.ndarray], np.ndarray]) -> PolicyFunctions:
+        assert self.source is not None
+        policy, value, view = policy_function(self.agent), value_function(self.agent), self.source.view
         return PolicyFunctions(
             policy=lambda observations: policy(view.observe(observations)),
             value=lambda observations, actions: value(view.observe(observations), actions),
-            gamma=gamma,
+            gamma=self.agent.gamma,
             unscale_action=unscale,
             scale_reward=view.scale_reward,
             act_dim=self._act_dim,
         )
+
+    def _say(self, message: str) -> None:
+        if message != self._said:
+            self._said = message
+            logger.info(message)
 
     def unscale(self, actions: np.ndarray) -> np.ndarray:
         """Turn scaled actions into actions of the environment.

@@ -195,6 +195,8 @@ class ExpandedReplayBuffer(ReplayBuffer):
         :param rng: given to the forward model and the actor.
         :param env: normalises observations and rewards.
         """
+        if self._roll_forward_compiled(states, going, path, env):
+            return
         returns, lengths, terminated, last = path
         agent, planner = self.expanding_agent, self.expanding_agent.planner
         model, view = planner.model, planner.source.view
@@ -219,6 +221,27 @@ class ExpandedReplayBuffer(ReplayBuffer):
             if len(still) < len(going):
                 model.select(still)
                 going = going[still]
+
+    def _roll_forward_compiled(
+        self, states: np.ndarray, going: np.ndarray, path: "_Path", env: VecNormalize | None
+    ) -> bool:
+        """:meth:`_roll_forward` in compiled code.
+
+        :return: False, and nothing is done, if that does not cover the agent.
+        """
+        agent = self.expanding_agent
+        compiled = None if isinstance(agent, STOCHASTIC) else agent.planner.compiled_policy(target=True)
+        if compiled is None or not compiled.normalizes_like(env):
+            return False
+        returns, lengths, terminated, last = path
+        rolled = compiled.follow(list(states), take_rows(last, going), agent.value_expansion)
+        agent.n_simulated_steps += rolled.simulated_steps
+        returns[going] += agent.gamma * rolled.returns[:, 0]
+        lengths[going] += rolled.lengths[:, 0]
+        simulated = rolled.lengths[:, 0] > 0
+        terminated[going[simulated]] = rolled.terminated[simulated, 0]
+        put_rows(last, going[simulated], rolled.observations[:, 0], simulated)
+        return True
 
     def _as_samples(self, at: tuple[np.ndarray, ...], path: "_Path", env: VecNormalize | None) -> Samples:
         """Make a batch, with discounts for the next observations' values.

@@ -1,81 +1,48 @@
-"""How environment classes compute observation, reward and termination, as array code.
+"""How environment classes compute observation, reward and termination, as functions of one row.
 
 A family is what :class:`~sb3_mcbs.models.mujoco_batch.MujocoBatchModel` needs to know about one environment
-class: the attributes and ``MjData`` fields that it reads, and a function that computes the transitions of
-many rows. ``docs/forward_models.md`` shows step by step how to add one.
+class: plain Python functions of one simulation, which numba compiles. ``docs/forward_models.md`` shows step
+by step how to add one.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any
 
-import mujoco
 import numpy as np
 from gymnasium.envs.mujoco import MujocoEnv
 
-#: ``rows.qpos`` is ``[rows, nq]``, ``rows.xpos`` is ``[rows, nbody, 3]``, and so on.
-Rows = SimpleNamespace
-#: Observations ``[rows, *obs_shape]``, rewards ``[rows]``, terminated ``[rows]``.
-Outcome = tuple[np.ndarray, np.ndarray, np.ndarray]
+#: Numbers, booleans and arrays by name.
+Constants = dict[str, Any]
 
 
-class Fields(NamedTuple):
-    """Which ``MjData`` fields a transition reads.
-
-    :param before: fields at the beginning of the step. Those that are not part of MuJoCo's state (``xpos``)
-        lag behind it, exactly as they do in the environment.
-    :param after: fields at the end of the step.
-    """
-
-    before: tuple[str, ...]
-    after: tuple[str, ...]
-
-
-class Constants:
-    """What does not change from step to step, under the names that the environment uses.
-
-    :param model: the environment's MuJoCo model.
-    :param frame_skip: simulation substeps in an environment step.
-    :param attributes: the environment's attributes that its family named.
-    """
-
-    def __init__(self, model: mujoco.MjModel, frame_skip: int, attributes: dict[str, Any]) -> None:
-        self.model = model
-        self.frame_skip = frame_skip
-        self.dt = model.opt.timestep * frame_skip
-        self.attributes = attributes
-
-    def __getattr__(self, name: str) -> Any:
-        # Only for names that are not set above; pickle asks before attributes exists.
-        attributes = self.__dict__.get("attributes", {})
-        if name in attributes:
-            return attributes[name]
-        raise AttributeError(
-            f"{name!r} is not among the attributes that the family names "
-            f"({', '.join(attributes) or 'none'}); add it to Family.attributes"
-        )
-
-    def body(self, key: int | str) -> int:
-        """The id of a body, from its name or its id."""
-        return int(self.model.body(key).id)
+def keep_nothing(env: Any, data: Any, kept: np.ndarray) -> None:
+    """The ``keep`` of families whose transitions depend on nothing but the state after the step."""
 
 
 @dataclass(frozen=True)
 class Family:
-    """Array code for one environment class.
+    """One environment class.
 
-    :param attributes: names of the environment's attributes that ``fields`` and ``transition`` read.
-    :param fields: ``fields(env) -> Fields``, with ``env`` a :class:`Constants`.
-    :param transition: ``transition(env, before, after, actions) -> (observations, rewards,
-        terminated)``, with the fields as ``[rows, ...]`` arrays (``before.qpos``) and the actions
-        ``[rows, act_dim]`` in the dtype that the environment gets. It returns new arrays, and its
-        numbers are the environment's own, bit for bit.
+    ``transition`` and ``keep`` are compiled, so they use what numba supports. In them ``env.dt`` is a
+    constant, and ``data.qpos`` a field of the row's ``MjData``.
+
+    :param constants: ``constants(env) -> dict``, in plain Python: the numbers, booleans and arrays that a
+        step reads, by name. ``env`` is the environment.
+    :param fields: the ``MjData`` fields that a step reads.
+    :param transition: ``transition(env, kept, data, action, observation) -> (reward, terminated)``, after
+        MuJoCo's steps. It writes into ``observation`` ``[obs_dim]``. The action has the dtype that the
+        environment gets. Its numbers are the environment's own, bit for bit.
+    :param keep: ``keep(env, data, kept)``, after a step: writes into ``kept`` ``[n_kept]`` what the next
+        transition must know of the time before its step.
+    :param n_kept: how many numbers that are.
     """
 
-    attributes: tuple[str, ...]
-    fields: Callable[[Constants], Fields]
-    transition: Callable[[Constants, Rows, Rows, np.ndarray], Outcome]
+    constants: Callable[[Any], Constants]
+    fields: tuple[str, ...]
+    transition: Callable[[Any, np.ndarray, Any, np.ndarray, np.ndarray], tuple[float, bool]]
+    keep: Callable[[Any, Any, np.ndarray], None] = keep_nothing
+    n_kept: int = 0
 
 
 _FAMILIES: dict[type, Family] = {}
@@ -86,7 +53,7 @@ def register_family(env_class: type[MujocoEnv], family: Family) -> None:
 
     :param env_class: the environment class. Its subclasses are not included: they may override
         anything.
-    :param family: its array code. It replaces the one that the class had.
+    :param family: its functions. It replaces the one that the class had.
     :raises TypeError: if ``env_class`` is not a ``MujocoEnv`` or ``family`` not a ``Family``.
     """
     if not (isinstance(env_class, type) and issubclass(env_class, MujocoEnv)):
@@ -104,34 +71,3 @@ def family_of(env_class: type) -> Family | None:
 def known_families() -> tuple[type, ...]:
     """Every class that has a family."""
     return tuple(_FAMILIES)
-
-
-# The helpers below repeat, for many rows, what NumPy computes for one. Other formulas that are as
-# good mathematically round differently.
-
-
-def row_norms(vectors: np.ndarray) -> np.ndarray:
-    """``np.linalg.norm`` of each row of ``[rows, n]``, as for a vector on its own."""
-    # norm(x, axis=1) squares and adds; norm(x) asks BLAS for a dot product, as vecdot does.
-    if hasattr(np, "vecdot"):
-        norms: np.ndarray = np.sqrt(np.vecdot(vectors, vectors))
-        return norms
-    return np.array([np.linalg.norm(vector) for vector in vectors])
-
-
-def sum_of_squares(values: np.ndarray) -> np.ndarray:
-    """``np.sum(np.square(row))`` of each row of ``[rows, ...]``, in the dtype of the values."""
-    squares = np.square(values.reshape(len(values), -1))
-    total: np.ndarray = squares.sum(axis=1)
-    return total
-
-
-def scalar_power(values: np.ndarray, exponent: int) -> np.ndarray:
-    """``value ** exponent`` of each NumPy scalar in ``[rows]``."""
-    # Scalars go through the C library's pow, arrays are squared: the last bit may differ.
-    return np.array([value**exponent for value in values.tolist()])
-
-
-def no_termination(rows: int) -> np.ndarray:
-    """``terminated`` of environments that never end: ``[rows]`` False."""
-    return np.zeros(rows, dtype=bool)

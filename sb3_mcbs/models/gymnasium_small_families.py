@@ -1,5 +1,8 @@
 """The families of Gymnasium's small MuJoCo tasks: pendulums, Reacher and Pusher."""
 
+from functools import partial
+from typing import Any
+
 import numpy as np
 from gymnasium.envs.mujoco import (
     inverted_double_pendulum_v4,
@@ -11,133 +14,129 @@ from gymnasium.envs.mujoco import (
     reacher_v5,
 )
 
-from sb3_mcbs.models.families import (
-    Constants,
-    Family,
-    Fields,
-    Outcome,
-    Rows,
-    no_termination,
-    register_family,
-    row_norms,
+from sb3_mcbs.models.compiling import compiled
+from sb3_mcbs.models.families import Constants, Family, register_family
+from sb3_mcbs.models.row_arithmetic import (
+    all_finite,
+    norm,
+    put,
+    put_clipped,
     scalar_power,
-    sum_of_squares,
+    weighted_squares,
+    widens,
 )
-
-
-def _body(env: Constants, rows: Rows, name: str) -> np.ndarray:
-    position: np.ndarray = rows.xpos[:, env.body(name)]
-    return position
-
 
 # Pendulums -----------------------------------------------------------------------------------
 
 
-def _pendulum_fields(_env: Constants) -> Fields:
-    return Fields(before=(), after=("qpos", "qvel"))
+def _pendulum_constants(_env: Any, version: int) -> Constants:
+    return {"always_paid": version == 4}
 
 
-def _pendulum(after: Rows) -> tuple[np.ndarray, np.ndarray]:
-    observation = np.concatenate((after.qpos, after.qvel), axis=1)
-    return observation, ~np.isfinite(observation).all(axis=1) | (np.abs(observation[:, 1]) > 0.2)
+def _pendulum(env: Any, kept: np.ndarray, data: Any, action: np.ndarray, observation: np.ndarray) -> Any:
+    put(observation, put(observation, 0, data.qpos), data.qvel)
+    terminated = not all_finite(observation) or abs(observation[1]) > 0.2
+    return (1.0 if env.always_paid or not terminated else 0.0), terminated
 
 
-def _pendulum_v4(env: Constants, before: Rows, after: Rows, actions: np.ndarray) -> Outcome:
-    observation, terminated = _pendulum(after)
-    return observation, np.ones(len(actions)), terminated
+def _double_pendulum_constants(env: Any, version: int) -> Constants:
+    if version == 4:
+        return {"alive_bonus": 10, "paid_at_the_end": True, "n_forces": env.model.nv}
+    return {"alive_bonus": env._healthy_reward, "paid_at_the_end": False, "n_forces": 1}
 
 
-def _pendulum_v5(env: Constants, before: Rows, after: Rows, actions: np.ndarray) -> Outcome:
-    observation, terminated = _pendulum(after)
-    return observation, (~terminated).astype(np.float64), terminated
+def _double_pendulum(
+    env: Any, kept: np.ndarray, data: Any, action: np.ndarray, observation: np.ndarray
+) -> Any:
+    angles, qvel = data.qpos[1:], data.qvel
+    end = put(observation, 0, data.qpos[:1])
+    end = put(observation, end, np.sin(angles))
+    end = put(observation, end, np.cos(angles))
+    end = put_clipped(observation, end, qvel, -10.0, 10.0)
+    put_clipped(observation, end, data.qfrc_constraint[: env.n_forces], -10.0, 10.0)
+    x, y = data.site_xpos[0, 0], data.site_xpos[0, 2]
+    terminated = y <= 1
+    dist_penalty = 0.01 * scalar_power(x, 2.0) + scalar_power(y - 2, 2.0)
+    vel_penalty = 1e-3 * scalar_power(qvel[1], 2.0) + 5e-3 * scalar_power(qvel[2], 2.0)
+    alive_bonus = env.alive_bonus * (1.0 if env.paid_at_the_end or not terminated else 0.0)
+    return alive_bonus - dist_penalty - vel_penalty, terminated
 
 
-def _double_pendulum_fields(_env: Constants) -> Fields:
-    return Fields(before=(), after=("qpos", "qvel", "site_xpos", "qfrc_constraint"))
-
-
-def _double_pendulum(after: Rows, n_constraint_forces: int | None) -> tuple[np.ndarray, ...]:
-    angles = np.ascontiguousarray(after.qpos[:, 1:])
-    forces = np.clip(after.qfrc_constraint, -10, 10)[:, :n_constraint_forces]
-    parts = (after.qpos[:, :1], np.sin(angles), np.cos(angles), np.clip(after.qvel, -10, 10), forces)
-    x, y = after.site_xpos[:, 0, 0], after.site_xpos[:, 0, 2]
-    dist_penalty = 0.01 * scalar_power(x, 2) + scalar_power(y - 2, 2)
-    vel_penalty = 1e-3 * scalar_power(after.qvel[:, 1], 2) + 5e-3 * scalar_power(after.qvel[:, 2], 2)
-    return np.concatenate(parts, axis=1), dist_penalty, vel_penalty, y <= 1
-
-
-def _double_pendulum_v4(env: Constants, before: Rows, after: Rows, actions: np.ndarray) -> Outcome:
-    observation, dist_penalty, vel_penalty, terminated = _double_pendulum(after, None)
-    return observation, 10 - dist_penalty - vel_penalty, terminated
-
-
-def _double_pendulum_v5(env: Constants, before: Rows, after: Rows, actions: np.ndarray) -> Outcome:
-    observation, dist_penalty, vel_penalty, terminated = _double_pendulum(after, 1)
-    alive_bonus = env._healthy_reward * (~terminated).astype(np.int64)
-    return observation, alive_bonus - dist_penalty - vel_penalty, terminated
-
-
-register_family(inverted_pendulum_v4.InvertedPendulumEnv, Family((), _pendulum_fields, _pendulum_v4))
-register_family(inverted_pendulum_v5.InvertedPendulumEnv, Family((), _pendulum_fields, _pendulum_v5))
-register_family(
-    inverted_double_pendulum_v4.InvertedDoublePendulumEnv,
-    Family((), _double_pendulum_fields, _double_pendulum_v4),
-)
-register_family(
-    inverted_double_pendulum_v5.InvertedDoublePendulumEnv,
-    Family(("_healthy_reward",), _double_pendulum_fields, _double_pendulum_v5),
-)
+_DOUBLE = ("qpos", "qvel", "site_xpos", "qfrc_constraint")
+for _pendulum_class, _double_class, _version in (
+    (inverted_pendulum_v4.InvertedPendulumEnv, inverted_double_pendulum_v4.InvertedDoublePendulumEnv, 4),
+    (inverted_pendulum_v5.InvertedPendulumEnv, inverted_double_pendulum_v5.InvertedDoublePendulumEnv, 5),
+):
+    _constants = partial(_pendulum_constants, version=_version)
+    register_family(_pendulum_class, Family(_constants, ("qpos", "qvel"), _pendulum))
+    _constants = partial(_double_pendulum_constants, version=_version)
+    register_family(_double_class, Family(_constants, _DOUBLE, _double_pendulum))
 
 
 # Reacher and Pusher --------------------------------------------------------------------------
 
 
-def _to_target(env: Constants, rows: Rows) -> np.ndarray:
-    return _body(env, rows, "fingertip") - _body(env, rows, "target")
+def _arm_constants(env: Any, bodies: tuple[str, ...], n_target: int) -> Constants:
+    """The weights, where there are any, and the bodies' ids."""
+    control = getattr(env, "_reward_control_weight", 1)
+    return {
+        "near_weight": getattr(env, "_reward_near_weight", 1),
+        "dist_weight": getattr(env, "_reward_dist_weight", 1),
+        "control_weight": control,
+        "control_widens": widens(control),
+        "n_target": n_target,
+        **{name: int(env.model.body(name).id) for name in bodies},
+    }
 
 
-def _reacher_observation(env: Constants, after: Rows, n_target: int) -> np.ndarray:
-    theta = np.ascontiguousarray(after.qpos[:, :2])
-    parts = (
-        np.cos(theta),
-        np.sin(theta),
-        after.qpos[:, 2:],
-        after.qvel[:, :2],
-        _to_target(env, after)[:, :n_target],
-    )
-    return np.concatenate(parts, axis=1)
+def _keep_distance(env: Any, data: Any, kept: np.ndarray) -> None:
+    kept[0] = norm(data.xpos[env.fingertip] - data.xpos[env.target])
 
 
-def _reacher_fields_v4(_env: Constants) -> Fields:
-    return Fields(before=("xpos",), after=("qpos", "qvel", "xpos"))
+@compiled
+def _observe_reacher(env: Any, data: Any, observation: np.ndarray) -> None:
+    end = put(observation, 0, np.cos(data.qpos[:2]))
+    end = put(observation, end, np.sin(data.qpos[:2]))
+    end = put(observation, end, data.qpos[2:])
+    end = put(observation, end, data.qvel[:2])
+    put(observation, end, (data.xpos[env.fingertip] - data.xpos[env.target])[: env.n_target])
 
 
-def _reacher_v4(env: Constants, before: Rows, after: Rows, actions: np.ndarray) -> Outcome:
+def _reacher_v4(env: Any, kept: np.ndarray, data: Any, action: np.ndarray, observation: np.ndarray) -> Any:
+    _observe_reacher(env, data, observation)
     # This version pays for the distance at which the step began.
-    reward = -row_norms(_to_target(env, before)) + -sum_of_squares(actions)
-    return _reacher_observation(env, after, 3), reward, no_termination(len(actions))
+    return -kept[0] - weighted_squares(1, False, action), False
 
 
-def _arm_fields_v5(_env: Constants) -> Fields:
-    return Fields(before=(), after=("qpos", "qvel", "xpos"))
+def _reacher_v5(env: Any, kept: np.ndarray, data: Any, action: np.ndarray, observation: np.ndarray) -> Any:
+    _observe_reacher(env, data, observation)
+    reward_dist = -norm(data.xpos[env.fingertip] - data.xpos[env.target]) * env.dist_weight
+    return reward_dist - weighted_squares(env.control_weight, env.control_widens, action), False
 
 
-def _reacher_v5(env: Constants, before: Rows, after: Rows, actions: np.ndarray) -> Outcome:
-    reward_dist = -row_norms(_to_target(env, after)) * env._reward_dist_weight
-    reward = reward_dist + -sum_of_squares(actions) * env._reward_control_weight
-    return _reacher_observation(env, after, 2), reward, no_termination(len(actions))
+def _pusher_v5(env: Any, kept: np.ndarray, data: Any, action: np.ndarray, observation: np.ndarray) -> Any:
+    arm, pushed, goal = data.xpos[env.tips_arm], data.xpos[env.object], data.xpos[env.goal]
+    reward_near = -norm(pushed - arm) * env.near_weight
+    reward_dist = -norm(pushed - goal) * env.dist_weight
+    reward_ctrl = -weighted_squares(env.control_weight, env.control_widens, action)
+    end = put(observation, 0, data.qpos[:7])
+    end = put(observation, end, data.qvel[:7])
+    end = put(observation, end, arm)
+    end = put(observation, end, pushed)
+    put(observation, end, goal)
+    return reward_dist + reward_ctrl + reward_near, False
 
 
-def _pusher_v5(env: Constants, before: Rows, after: Rows, actions: np.ndarray) -> Outcome:
-    arm, pushed, goal = (_body(env, after, name) for name in ("tips_arm", "object", "goal"))
-    reward_near = -row_norms(pushed - arm) * env._reward_near_weight
-    reward_dist = -row_norms(pushed - goal) * env._reward_dist_weight
-    reward_ctrl = -sum_of_squares(actions) * env._reward_control_weight
-    observation = np.concatenate((after.qpos[:, :7], after.qvel[:, :7], arm, pushed, goal), axis=1)
-    return observation, reward_dist + reward_ctrl + reward_near, no_termination(len(actions))
-
-
-_WEIGHTS = ("_reward_dist_weight", "_reward_control_weight")
-register_family(reacher_v4.ReacherEnv, Family((), _reacher_fields_v4, _reacher_v4))
-register_family(reacher_v5.ReacherEnv, Family(_WEIGHTS, _arm_fields_v5, _reacher_v5))
-register_family(pusher_v5.PusherEnv, Family((*_WEIGHTS, "_reward_near_weight"), _arm_fields_v5, _pusher_v5))
+_ARM = ("qpos", "qvel", "xpos")
+_REACHER = ("fingertip", "target")
+register_family(
+    reacher_v4.ReacherEnv,
+    Family(partial(_arm_constants, bodies=_REACHER, n_target=3), _ARM, _reacher_v4, _keep_distance, n_kept=1),
+)
+register_family(
+    reacher_v5.ReacherEnv, Family(partial(_arm_constants, bodies=_REACHER, n_target=2), _ARM, _reacher_v5)
+)
+register_family(
+    pusher_v5.PusherEnv,
+    Family(partial(_arm_constants, bodies=("tips_arm", "object", "goal"), n_target=3), _ARM, _pusher_v5),
+)

@@ -1,16 +1,19 @@
-"""The forward model for known MuJoCo environments: physics on threads, the rest as array code."""
+"""The forward model for known MuJoCo environments: compiled code on threads."""
 
-import math
 import os
 from collections.abc import Sequence
+from types import SimpleNamespace
 from typing import Any
 
 import mujoco
 import numpy as np
+from mujoco.batch import Batch
 
-from sb3_mcbs.models.engines import INTEGRATION, STATE_FIELDS, Engine, make_engine
+from sb3_mcbs.models.compiled_rollout import RolloutRows, short_horizon
+from sb3_mcbs.models.compiled_rows import Rows, step_rows
 from sb3_mcbs.models.environments import Environments
-from sb3_mcbs.models.families import Rows, family_of
+from sb3_mcbs.models.families import family_of
+from sb3_mcbs.models.libmujoco import INTEGRATION
 from sb3_mcbs.models.recognition import (
     CHECK_ROLLOUTS,
     CHECK_STEPS,
@@ -21,13 +24,12 @@ from sb3_mcbs.models.recognition import (
     recognize,
     sample_transitions,
 )
+from sb3_mcbs.models.simulator import Simulator
 from sb3_mcbs.models.workers import WorkerError
-from sb3_mcbs.types import ForwardModel, ForwardModelError, Transition
+from sb3_mcbs.types import ForwardModel, ForwardModelError, PolicyArrays, PolicyRollouts, Transition
 
-_FIRST_CAPACITY = 32
-
-# Engines inherited from the parent of a forked process. Freeing one would wait for threads that do not exist.
-_OF_THE_PARENT: list[Engine] = []
+# Inherited from the parent of a forked process. Freeing one would wait for threads that do not exist.
+_OF_THE_PARENT: list[Simulator] = []
 
 
 def usable_cores() -> int:
@@ -54,6 +56,9 @@ class MujocoBatchModel(ForwardModel):
         than ``OMP_NUM_THREADS``. The results do not depend on it.
     :raises ForwardModelError: if the environments are not of a known family, or if the model and a
         copy of an environment disagree on random transitions.
+
+    :ivar simulator: the compiled code and its threads.
+    :ivar states: ``[rows, state_size]``, the present integration states.
     """
 
     deterministic = True
@@ -64,13 +69,12 @@ class MujocoBatchModel(ForwardModel):
             raise ValueError(f"n_threads must be 0 (all processors) or more, got {n_threads}")
         self._environments = environments
         self._n_threads = n_threads or available_cpus()
-        self._engine: Engine | None = None
-        self._rows = 0
+        self.simulator: Simulator = None  # type: ignore[assignment]
         self.refresh()
 
     @property
     def n_rows(self) -> int:
-        return self._rows
+        return len(self.states)
 
     def refresh(self) -> None:
         known = self._recognize_all()
@@ -90,17 +94,34 @@ class MujocoBatchModel(ForwardModel):
         """Take over the environments' present model and constants, without rows."""
         family = family_of(known.env_class)
         assert family is not None
-        self._family = family
-        self._constants = known.constants
-        self._fields = family.fields(known.constants)
-        self._lagging = tuple(name for name in self._fields.before if name not in STATE_FIELDS)
-        self._state_size = mujoco.mj_stateSize(known.constants.model, INTEGRATION)
-        self._build(_FIRST_CAPACITY)
+        self._known, self._n_kept = known, family.n_kept
+        self._state_size = mujoco.mj_stateSize(known.model, INTEGRATION)
+        self._reading = self._state_size, SimpleNamespace(**known.constants)
+        self._act_dim = known.model.nu
+        self.states = np.zeros((0, self._state_size))
+        self._kept = np.zeros((0, self._n_kept))
+        self._diverged = self._ended = np.zeros(0, dtype=bool)
         self._any_marked = False
-        self._rows = 0
+        name = known.env_class.__name__
         n_threads = f"{self._n_threads} thread{'s' if self._n_threads > 1 else ''}"
-        engine = type(self._engine).__name__
-        self.description = f"MuJoCo batch of {known.env_class.__name__} ({engine}, {n_threads})"
+        self.description = f"MuJoCo batch of {name} (compiled, {n_threads})"
+        self._build()
+
+    def _build(self) -> None:
+        """Make the simulations and threads."""
+        self.close()
+        known, family = self._known, family_of(self._known.env_class)
+        assert family is not None
+        try:
+            # It refuses models whose rows cannot share an MjData, which holds here as well.
+            Batch(known.model, 1, 1)
+            name = known.env_class.__name__
+            self.simulator = Simulator(
+                family, name, known.constants, known.model, known.frame_skip, self._n_threads
+            )
+        except ValueError as error:
+            raise ForwardModelError(f"the batch cannot simulate this model: {error}") from error
+        self._process = os.getpid()
 
     def _recognize_all(self) -> KnownEnvironment:
         found = self._environments.apply(range(len(self._environments)), recognize)
@@ -114,128 +135,111 @@ class MujocoBatchModel(ForwardModel):
                 raise NotRecognizedError(f"environments 0 and {number} differ in their {difference}")
         return first
 
-    def _build(self, capacity: int) -> None:
-        """Make an engine with room for ``capacity`` rows, all empty."""
-        names = tuple(dict.fromkeys(("ctrl", *self._fields.before, *self._fields.after)))
-        self.close()
-        try:
-            self._engine = make_engine(self._constants.model, capacity, names, self._n_threads)
-        except ValueError as error:
-            raise ForwardModelError(f"the batch cannot simulate this model: {error}") from error
-        self._constants.model = self._engine.model
-        self._process = os.getpid()
-        self._capacity = capacity
-        self._arrays = {name: self._engine.field(name) for name in names}
-        self._before = {
-            name: np.zeros(self._arrays[name].shape, dtype=self._arrays[name].dtype)
-            for name in self._fields.before
-        }
-        self._diverged = np.zeros(capacity, dtype=bool)
-        self._ended = np.zeros(capacity, dtype=bool)
-        self._views: dict[int, tuple[Rows, Rows, np.ndarray]] = {}
-
-    def _memory(self) -> list[np.ndarray]:
-        """The complete state of the rows as ``[capacity, ...]`` arrays, without their marks."""
-        assert self._engine is not None
-        return [self._engine.state, *(self._before[name] for name in self._lagging)]
-
-    def _fill(self, values: Sequence[np.ndarray], rows: int) -> None:
-        """Set the state of the first rows, in a larger engine if this one is too small."""
-        if rows > self._capacity:
-            self._build(max(rows, 2 * self._capacity))
-        for memory, value in zip(self._memory(), values, strict=True):
-            memory[:rows] = value
-        self._rows = rows
-
     def read_roots(self, env_indices: Sequence[int]) -> list[Any]:
-        return self._environments.apply(env_indices, read_root, self._state_size, self._lagging)
+        return self._environments.apply(env_indices, read_root, *self._reading)
 
     def set_roots(self, roots: Sequence[Any], index: np.ndarray, rng: np.random.Generator) -> None:
-        table = np.stack(roots)[index]
+        self.states, self._kept = self.split_roots(roots, index)
+        self._diverged, self._ended = np.zeros((2, len(index)), dtype=bool)
+        self._any_marked = False
+
+    def split_roots(self, roots: Sequence[Any], index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Copy roots for rows.
+
+        :param roots: from :meth:`read_roots`.
+        :param index: ``[rows]``, the root of every row.
+        :return: states ``[rows, state_size]``, and what the family keeps beside them ``[rows, n_kept]``.
+        :raises ValueError: if the roots are not those of this model.
+        """
         if self._process != os.getpid():
-            self._build(self._capacity)  # threads do not survive a fork
-        if table.shape[1] != self._state_size + sum(self._before[name][0].size for name in self._lagging):
+            self._build()  # threads do not survive a fork
+        table = np.stack(roots)[index]
+        if table.shape[1] != self._state_size + self._n_kept:
             raise ValueError("these roots were read by another model")
-        rows = len(table)
-        values, start = [table[:, : self._state_size]], self._state_size
-        for name in self._lagging:
-            shape = self._before[name].shape[1:]
-            size = int(np.prod(shape))
-            values.append(table[:, start : start + size].reshape(rows, *shape))
-            start += size
-        self._fill(values, rows)
-        self._diverged[...] = self._ended[...] = self._any_marked = False
+        states, kept = table[:, : self._state_size], table[:, self._state_size :]
+        return np.ascontiguousarray(states), np.ascontiguousarray(kept)
 
     def select(self, index: np.ndarray) -> None:
-        values = [memory[: self._rows].take(index, axis=0) for memory in self._memory()]
-        diverged, ended = self._diverged[: self._rows], self._ended[: self._rows]
-        self._fill(values, len(index))
-        if self._any_marked:
-            self._diverged[: len(index)] = diverged[index]
-            self._ended[: len(index)] = ended[index]
-
-    def _view(self, rows: int) -> tuple[Rows, Rows, np.ndarray]:
-        """The fields of the first rows, before and after a step, and their controls."""
-        view = self._views.get(rows)
-        if view is None:
-            before = Rows(**{name: self._before[name][:rows] for name in self._fields.before})
-            after = Rows(**{name: self._arrays[name][:rows] for name in self._fields.after})
-            view = self._views[rows] = (before, after, self._arrays["ctrl"][:rows])
-        return view
+        self.states, self._kept = self.states[index], self._kept[index]
+        self._diverged, self._ended = self._diverged[index], self._ended[index]
 
     def step(self, actions: np.ndarray) -> Transition:
-        assert self._engine is not None
-        rows = self._rows
-        before, after, controls = self._view(rows)
-        if actions.shape != controls.shape:
-            raise ValueError(
-                f"expected actions of shape {controls.shape} [rows, act_dim], got {actions.shape}"
-            )
-        actions = np.ascontiguousarray(actions)
-        for name in self._fields.before:
-            if name not in self._lagging:
-                self._before[name][:rows] = self._arrays[name][:rows]
-        controls[...] = actions
-        diverged = self._engine.step(rows, self._constants.frame_skip)
-        observations, rewards, terminated = self._family.transition(self._constants, before, after, actions)
-        for name in self._lagging:
-            self._before[name][:rows] = self._arrays[name][:rows]
-        return Transition(
-            observations, rewards, terminated, self._mark(diverged, observations, rewards, terminated)
-        )
-
-    def _mark(
-        self,
-        diverged: np.ndarray | None,
-        observations: np.ndarray,
-        rewards: np.ndarray,
-        terminated: np.ndarray,
-    ) -> np.ndarray:
-        """Remember which rows are invalid and which have terminated.
-
-        :return: ``[rows]`` bool, which rows are valid.
-        """
-        rows = len(rewards)
-        # A sum is finite only if all its terms are; only otherwise is each of them checked.
-        if not math.isfinite(observations.sum() + rewards.sum()):
-            broken = ~(np.isfinite(observations).reshape(rows, -1).all(axis=1) & np.isfinite(rewards))
-            diverged = broken if diverged is None else diverged | broken
-        if diverged is None and not self._any_marked and not terminated.any():
-            return np.ones(rows, dtype=bool)
-        self._any_marked = True
-        if diverged is not None:
+        n_rows = self.n_rows
+        expected = (n_rows, self._act_dim)
+        if actions.shape != expected:
+            raise ValueError(f"expected actions of shape {expected} [rows, act_dim], got {actions.shape}")
+        terminated, valid = np.empty((2, n_rows), dtype=bool)
+        observations, rewards = np.empty((n_rows, self._obs_dim)), np.empty(n_rows)
+        rows = Rows(self.states, self._kept, observations, rewards, terminated, valid)
+        self.simulator.run(step_rows, n_rows, rows, np.ascontiguousarray(actions))
+        if self._any_marked or not valid.all() or terminated.any():
+            self._any_marked = True
             # A row cannot become invalid after it has terminated.
-            self._diverged[:rows] |= diverged & ~self._ended[:rows]
-        self._ended[:rows] |= terminated
-        return ~self._diverged[:rows]
+            self._diverged |= ~valid & ~self._ended
+            self._ended |= terminated
+            valid = ~self._diverged
+        return Transition(observations, rewards, terminated, valid)
+
+    def roll_out(
+        self,
+        roots: Sequence[Any],
+        index: np.ndarray,
+        policy: PolicyArrays,
+        actions: np.ndarray,
+        noise: np.ndarray,
+        n_shared: int,
+        bootstraps: bool = True,
+    ) -> PolicyRollouts:
+        """Roll a policy out, through all depths at once. The rows of :meth:`set_roots` are left as they are.
+
+        :param roots: from :meth:`read_roots`.
+        :param index: ``[candidates]`` integers into ``roots``.
+        :param policy: the actor and what lies between it and the environment.
+        :param actions: ``[candidates, act_dim]`` float32, the first ones, scaled to [-1, 1].
+        :param noise: ``[horizon, candidates, sim, act_dim]`` float32, added to the policy's actions after
+            each step. The first ``n_shared - 1`` are the same for all simulations of a candidate.
+        :param n_shared: steps that all simulations of a candidate share.
+        :param bootstraps: whether the returns contain the critics' values of the ends.
+        :return: the rollouts.
+        """
+        horizon, n_candidates, n_sim, act_dim = noise.shape
+        n_rows = n_candidates * n_sim
+        states, kept = self.split_roots(roots, np.repeat(index, n_sim))
+        rows = RolloutRows(
+            states,
+            kept,
+            np.repeat(actions, n_sim, axis=0),
+            np.ascontiguousarray(noise.reshape(horizon, n_rows, act_dim)),
+            returns=np.zeros(n_rows),
+            valid=np.ones(n_rows, dtype=bool),
+            terminated=np.zeros(n_rows, dtype=bool),
+            lengths=np.zeros(n_rows, dtype=np.int64),
+            observations=np.zeros((n_rows, self._obs_dim)),
+            first_observations=np.zeros((n_candidates, self._obs_dim)),
+            first_rewards=np.zeros(n_candidates),
+            n_steps=np.zeros(n_candidates, dtype=np.int64),
+        )
+        self.simulator.run(short_horizon, n_candidates, policy, rows, n_shared, bootstraps)
+        shape = n_candidates, n_sim
+        return PolicyRollouts(
+            rows.returns.reshape(shape),
+            rows.valid.reshape(shape),
+            rows.terminated.reshape(shape),
+            rows.lengths.reshape(shape),
+            rows.observations.reshape(*shape, self._obs_dim),
+            rows.actions.reshape(*shape, act_dim),
+            rows.first_observations,
+            rows.first_rewards,
+            int(rows.n_steps.sum()),
+        )
 
     def _check(self) -> None:
         """Compare with copies of the real environments on random transitions.
 
         :raises NotRecognizedError: at the first difference.
         """
-        arguments = (self._state_size, self._lagging)
-        sample: Sample = self._environments.apply([0], sample_transitions, *arguments)[0]
+        sample: Sample = self._environments.apply([0], sample_transitions, *self._reading)[0]
+        self._obs_dim = sample.observations[0, 0].size
         rng = np.random.default_rng(0)
         # All transitions as one batch, then whole rollouts, which also check what a row carries from step
         # to step.
@@ -244,7 +248,7 @@ class MujocoBatchModel(ForwardModel):
             self.set_roots(list(part.roots[:, 0]), np.arange(len(part.roots)), rng)
             for step in range(part.roots.shape[1]):
                 self._compare(self.step(part.actions[:, step]), part, step)
-        self._rows = 0
+        self.set_roots([np.zeros(self._state_size + self._n_kept)], np.zeros(0, dtype=int), rng)
 
     def _compare(self, simulated: Transition, real: Sample, step: int) -> None:
         expected = (real.observations[:, step], real.rewards[:, step], real.terminated[:, step])
@@ -261,9 +265,9 @@ class MujocoBatchModel(ForwardModel):
                 )
 
     def close(self) -> None:
-        if self._engine is None:
+        if self.simulator is None:
             return
         if self._process == os.getpid():
-            self._engine.close()
+            self.simulator.close()
         else:
-            _OF_THE_PARENT.append(self._engine)
+            _OF_THE_PARENT.append(self.simulator)

@@ -4,15 +4,15 @@ These functions run in the process where the environment lives, and only ever st
 """
 
 import pickle
-from collections.abc import Sequence
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import gymnasium as gym
 import mujoco
 import numpy as np
 
-from sb3_mcbs.models.engines import INTEGRATION
 from sb3_mcbs.models.families import Constants, family_of, known_families
+from sb3_mcbs.models.libmujoco import INTEGRATION
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 from sb3_mcbs.snapshot.layers import replaced_method
 from sb3_mcbs.snapshot.object_graph import class_name
@@ -53,23 +53,27 @@ class KnownEnvironment(NamedTuple):
     """What the batch model must know about one environment of a known family.
 
     :param env_class: its class.
-    :param constants: its present model and attributes.
+    :param constants: what its family reads from it at present.
+    :param model: its present model.
+    :param frame_skip: MuJoCo steps in an environment step.
     :param packed_model: the model as bytes, to be compared.
     """
 
     env_class: type
     constants: Constants
+    model: mujoco.MjModel
+    frame_skip: int
     packed_model: bytes
 
     def difference(self, other: "KnownEnvironment") -> str:
         """What distinguishes another environment from this one; empty if nothing does."""
         if self.env_class is not other.env_class:
             return f"class ({self.env_class.__name__}, {other.env_class.__name__})"
-        if self.constants.frame_skip != other.constants.frame_skip:
-            return f"frame_skip ({self.constants.frame_skip}, {other.constants.frame_skip})"
-        for name, value in self.constants.attributes.items():
-            if not np.array_equal(value, other.constants.attributes[name]):
-                return f"{name} ({value}, {other.constants.attributes[name]})"
+        if self.frame_skip != other.frame_skip:
+            return f"frame_skip ({self.frame_skip}, {other.frame_skip})"
+        for name, value in self.constants.items():
+            if not np.array_equal(value, other.constants[name]):
+                return f"{name} ({value}, {other.constants[name]})"
         return "MuJoCo models" if self.packed_model != other.packed_model else ""
 
 
@@ -104,10 +108,11 @@ def recognize(wrapper: SnapshotEnvWrapper) -> KnownEnvironment | NotRecognizedEr
     wrapper.verify()
     family = family_of(type(env))
     assert family is not None
-    attributes = {name: getattr(env, name) for name in family.attributes}
-    return KnownEnvironment(
-        type(env), Constants(env.model, env.frame_skip, attributes), pickle.dumps(env.model)
-    )
+    try:
+        constants = {"dt": env.dt, **family.constants(env)}
+    except AttributeError as error:
+        return NotRecognizedError(f"its family reads what {class_name(type(env))} does not have: {error}")
+    return KnownEnvironment(type(env), constants, env.model, env.frame_skip, pickle.dumps(env.model))
 
 
 def _reason_against(wrapper: SnapshotEnvWrapper) -> str:
@@ -129,17 +134,16 @@ def _reason_against(wrapper: SnapshotEnvWrapper) -> str:
         parents = [kind.__name__ for kind in env_class.__mro__[1:] if kind in known_families()]
         of = f"only its parent {parents[0]} is" if parents else "see register_family"
         return f"{class_name(env_class)} is not a known family ({of})"
-    missing = [name for name in family.attributes if not hasattr(layer, name)]
-    return f"{class_name(env_class)} has no {', '.join(missing)}, which its family reads" if missing else ""
+    return ""
 
 
-def read_root(wrapper: SnapshotEnvWrapper, state_size: int, lagging: Sequence[str]) -> np.ndarray:
+def read_root(wrapper: SnapshotEnvWrapper, state_size: int, constants: SimpleNamespace) -> np.ndarray:
     """Read the present state of an environment, as a root of the batch model.
 
     :param wrapper: the environment.
     :param state_size: size of its integration state.
-    :param lagging: derived fields whose values before the next step are needed too.
-    :return: ``[state_size + sizes of lagging]``.
+    :param constants: what its family read from it.
+    :return: ``[state_size + n_kept]``, the state and what the family keeps beside it.
     :raises ForwardModelError: if the size of the environment's state has changed.
     """
     env: Any = wrapper.unwrapped
@@ -147,19 +151,21 @@ def read_root(wrapper: SnapshotEnvWrapper, state_size: int, lagging: Sequence[st
     if mujoco.mj_stateSize(env.model, INTEGRATION) != state_size:
         name = type(env).__name__
         raise ForwardModelError(f"{name} has another MuJoCo model than its forward model: call refresh()")
-    state = np.empty(state_size)
-    mujoco.mj_getState(env.model, data, state, INTEGRATION)
-    if not lagging:
-        return state
-    return np.concatenate([state, *(getattr(data, name).ravel() for name in lagging)])
+    family = family_of(type(env))
+    assert family is not None
+    root = np.empty(state_size + family.n_kept)
+    mujoco.mj_getState(env.model, data, root[:state_size], INTEGRATION)
+    if family.n_kept:
+        family.keep(constants, data, root[state_size:])
+    return root
 
 
-def sample_transitions(wrapper: SnapshotEnvWrapper, state_size: int, lagging: Sequence[str]) -> Sample:
+def sample_transitions(wrapper: SnapshotEnvWrapper, state_size: int, constants: SimpleNamespace) -> Sample:
     """Step a copy of the environment with random actions.
 
     :param wrapper: the environment, left as it is.
     :param state_size: size of its integration state.
-    :param lagging: derived fields that belong to a root.
+    :param constants: what its family read from it.
     :return: the transitions of the copy.
     """
     rng = np.random.default_rng(0)
@@ -174,7 +180,7 @@ def sample_transitions(wrapper: SnapshotEnvWrapper, state_size: int, lagging: Se
                 copied.step(random_action(copied.action_space, rng))
             for _ in range(CHECK_STEPS):
                 action = random_action(copied.action_space, rng)
-                root = read_root(copied, state_size, lagging)
+                root = read_root(copied, state_size, constants)
                 observation, reward, terminated, _, _ = copied.step(action)
                 steps.append((root, action, np.array(observation), np.float64(reward), bool(terminated)))
     finally:

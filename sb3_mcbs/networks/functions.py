@@ -61,6 +61,18 @@ def _to_numpy(tensor: th.Tensor, device: th.device) -> np.ndarray:
     return (tensor if device.type == "cpu" else tensor.cpu()).numpy()
 
 
+def actor_of(agent: Any, target: bool = False) -> Any:
+    """The actor that acts, or that of the targets.
+
+    :param agent: a supported agent.
+    :param target: for training instead of acting: the target actor, if there is one.
+    """
+    # SB3 trains what the agent holds, and acts with what its policy holds.
+    if not target:
+        return agent.policy.actor
+    return agent.actor if isinstance(agent, STOCHASTIC) else agent.actor_target
+
+
 def policy_function(agent: OffPolicyAlgorithm, target: bool = False) -> Callable[[Observations], np.ndarray]:
     """The actor without exploration: its output (TD3, DDPG) or its squashed mean (others).
 
@@ -68,10 +80,7 @@ def policy_function(agent: OffPolicyAlgorithm, target: bool = False) -> Callable
     :param target: for training instead of acting: the target actor, if there is one.
     :return: observations ``[rows, *obs_shape]`` -> float32 actions ``[rows, act_dim]`` in [-1, 1].
     """
-    own: Any = agent
-    stochastic = isinstance(agent, STOCHASTIC)
-    # SB3 trains what the agent holds, and acts with what its policy holds.
-    actor = own.policy.actor if not target else own.actor if stochastic else own.actor_target
+    actor, stochastic = actor_of(agent, target), isinstance(agent, STOCHASTIC)
     with suppress(TypeError):
         return _plain_policy(actor_mlp(actor))
     device = agent.device if target else agent.policy.device
@@ -169,6 +178,16 @@ def soft_policy_function(
     return draw
 
 
+def unscales_as_sb3(agent: Any) -> bool:
+    """Whether actions are scaled by SB3's own formula, in float32.
+
+    :param agent: a supported agent.
+    """
+    policy = agent.policy
+    is_sb3s = getattr(type(policy), "unscale_action", None) is BasePolicy.unscale_action
+    return is_sb3s and "unscale_action" not in vars(policy) and policy.action_space.dtype == np.float32
+
+
 def unscale_function(agent: OffPolicyAlgorithm) -> Callable[[np.ndarray], np.ndarray]:
     """The function that turns scaled actions into actions of the environment.
 
@@ -177,8 +196,7 @@ def unscale_function(agent: OffPolicyAlgorithm) -> Callable[[np.ndarray], np.nda
     """
     policy: Any = agent.policy
     space = policy.action_space
-    is_sb3s = getattr(type(policy), "unscale_action", None) is BasePolicy.unscale_action
-    if not is_sb3s or "unscale_action" in vars(policy) or space.dtype != np.float32:
+    if not unscales_as_sb3(agent):
         return lambda actions: policy.unscale_action(actions.reshape(-1, *space.shape))
     low, half_range = space.low, 0.5 * (space.high - space.low)
 

@@ -6,11 +6,13 @@ For the small networks of continuous control these cost as much as the matrix pr
 
 from typing import Any
 
+import numpy as np
 import torch as th
 from sb3_contrib.common.torch_layers import BatchRenorm1d
 from torch import nn
 
 from sb3_mcbs.networks.batch_renorm import FusedBatchRenorm1d
+from sb3_mcbs.types import ACTIVATIONS
 
 
 def own_state(module: nn.Module) -> dict[str, Any]:
@@ -108,10 +110,20 @@ class _Normalization:
     def device(self) -> th.device:
         return self._columns[0].device
 
+    def factors(self) -> list[th.Tensor]:
+        """One factor and one summand per feature."""
+        with th.no_grad():
+            mean, deviation, scale, bias = (column[:, 0] for column in self._columns)
+            gain = scale / deviation
+            return [gain, bias - mean * gain]
+
     def __call__(self, x: th.Tensor) -> th.Tensor:
         # The layer's own operations in its order: the result is equal to the bit.
         mean, deviation, scale, bias = self._columns
         return (x - mean).div_(deviation).mul_(scale).add_(bias)
+
+
+_ACTIVATIONS = {nn.ReLU: ACTIVATIONS["relu"], nn.Tanh: ACTIVATIONS["tanh"]}
 
 
 def _check_parameter(parameter: th.Tensor, kind: type[th.Tensor] = nn.Parameter) -> None:
@@ -137,6 +149,7 @@ class MLP:
 
     def __init__(self, *modules: nn.Module) -> None:
         self._layers: list[_Linear | _Normalization | type[nn.Module]] = []
+        self._behind_addresses: list[th.Tensor] = []
         for module in modules:
             self._append(module)
         if not self._layers:
@@ -169,6 +182,36 @@ class MLP:
         first = self._layers[0]
         assert isinstance(first, _Linear | _Normalization)
         return first.device
+
+    def table(self) -> np.ndarray:
+        """The layers for compiled code, which are valid as long as this object lives.
+
+        :return: ``[layers, 7]`` int64, see :class:`~sb3_mcbs.types.Layer`.
+        :raises TypeError: if they lie on a GPU, or are not linear layers with at most one normalization
+            before and one activation after each.
+        """
+        if self.device.type != "cpu":
+            raise TypeError("the networks are not on the CPU")
+        table: list[list[int]] = []
+        before = [0, 0]
+        for layer in self._layers:
+            if isinstance(layer, _Normalization) and not any(before):
+                self._behind_addresses += (factors := layer.factors())
+                before = [factor.data_ptr() for factor in factors]
+            elif isinstance(layer, _Linear):
+                bias = layer.bias
+                if bias is None:
+                    self._behind_addresses.append(bias := th.zeros(len(layer.weight)))
+                n_out, n_in = layer.weight.shape
+                table.append([*before, layer.weight.data_ptr(), bias.data_ptr(), n_in, n_out, 0])
+                before = [0, 0]
+            elif not isinstance(layer, _Normalization) and not any(before) and not table[-1][-1]:
+                table[-1][-1] = _ACTIVATIONS[layer]
+            else:
+                raise TypeError("layers follow each other in an order that compiled code does not know")
+        if any(before):
+            raise TypeError("a normalization is the last layer")
+        return np.array(table, dtype=np.int64)
 
     @property
     def parameters(self) -> list[nn.Parameter]:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from sb3_mcbs.search.interface import (
+    CountedValue,
     FirstStep,
     PolicyFunctions,
     Rollouts,
@@ -78,6 +79,8 @@ def short_horizon(
     """
     model = roots.model
     assert model is not None, "a rollout needs a forward model"
+    if functions.rollout is not None:
+        return compiled_short_horizon(roots, candidates, functions, settings, noise)
     n_envs, beam, act_dim = candidates.shape
     n_sim = settings.distinct_simulations(model.deterministic)
     # The rollouts that each row of the model represents.
@@ -115,6 +118,30 @@ def short_horizon(
         values = functions.value(observations, actions).astype(np.float64)  # line 36
         returns[rollouts] += alpha * values[:, None]  # line 37
     return Rollouts(candidates, returns.reshape(n_envs, beam, n_sim), first_step, simulated_steps)
+
+
+def compiled_short_horizon(
+    roots: Roots, candidates: np.ndarray, functions: PolicyFunctions, settings: SearchSettings, noise: Noise
+) -> Rollouts:
+    """:func:`short_horizon` where compiled code covers its loop (``models/compiled_rollout.py``)."""
+    assert functions.rollout is not None
+    n_envs, beam, act_dim = candidates.shape
+    n_sim, hold = settings.distinct_simulations(deterministic=True), settings.noise_hold
+    later = np.repeat(noise.rollout[:, :, :, :n_sim], hold, axis=0)[: settings.horizon - hold + 1]
+    held = np.broadcast_to(noise.beam[:, :, None], (hold - 1, *later.shape[1:]))
+    every_noise = np.concatenate([held, later]) if hold > 1 else later
+    rolled = functions.rollout(
+        roots.states,
+        np.repeat(np.arange(n_envs), beam),
+        candidates.reshape(-1, act_dim),
+        every_noise.reshape(settings.horizon, n_envs * beam, n_sim, act_dim),
+        hold,
+    )
+    if isinstance(functions.value, CountedValue):
+        functions.value.count(int(np.count_nonzero(rolled.valid & ~rolled.terminated)))
+    returns = np.where(rolled.valid, rolled.returns, np.nan)
+    first_step = FirstStep(rolled.first_observations, rolled.first_rewards)
+    return Rollouts(candidates, returns.reshape(n_envs, beam, n_sim), first_step, rolled.simulated_steps)
 
 
 def held_noise(

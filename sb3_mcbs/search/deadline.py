@@ -210,7 +210,7 @@ def deadline_search(
     policy_actions = functions.policy(roots.observations)
     n_envs, act_dim = policy_actions.shape
     value = CountedValue(functions.value)
-    functions = functions._replace(value=value)
+    functions = functions._replace(value=value, rollout=None)  # a round can be abandoned between its steps
     enough = settings.max_beam_width or settings.beam_width
     rounds: list[Rollouts] = []
     given_up = done = 0

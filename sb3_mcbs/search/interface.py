@@ -9,7 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_mcbs.types import ForwardModel, Observations, Transition, take_rows
+from sb3_mcbs.types import ForwardModel, Observations, PolicyRollouts, Transition, take_rows
+
+RolloutFunction = Callable[[Sequence[Any], np.ndarray, np.ndarray, np.ndarray, int], PolicyRollouts]
 
 
 class Roots(NamedTuple):
@@ -36,6 +38,9 @@ class PolicyFunctions(NamedTuple):
     :param unscale_action: scaled actions ``[rows, act_dim]`` -> actions of the environment.
     :param scale_reward: rewards of the environment ``[rows]`` -> the critics' scale.
     :param act_dim: action dimensions.
+    :param rollout: rolls the policy out in compiled code, with the arguments root states, root index
+        ``[candidates]``, first actions, noise and the number of shared steps, as
+        :meth:`MujocoBatchModel.roll_out`; ``None`` where that does not cover the networks or the environment.
     """
 
     policy: Callable[[Observations], np.ndarray]
@@ -44,6 +49,7 @@ class PolicyFunctions(NamedTuple):
     unscale_action: Callable[[np.ndarray], np.ndarray]
     scale_reward: Callable[[np.ndarray], np.ndarray]
     act_dim: int
+    rollout: RolloutFunction | None = None
 
 
 class CountedValue:
@@ -57,6 +63,10 @@ class CountedValue:
     def __init__(self, value: Callable[[Observations, np.ndarray], np.ndarray]) -> None:
         self._value = value
         self.evaluations = 0
+
+    def count(self, evaluations: int) -> None:
+        """Count pairs that were evaluated elsewhere."""
+        self.evaluations += evaluations
 
     def __call__(self, observations: Observations, actions: np.ndarray) -> np.ndarray:
         self.evaluations += len(actions)
