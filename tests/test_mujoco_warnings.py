@@ -8,9 +8,12 @@ from typing import Any
 
 import gymnasium as gym
 import mujoco
+import numpy as np
 import pytest
 
-from sb3_mcbs.models.engines import BatchEngine
+from sb3_mcbs import SnapshotEnvWrapper
+from sb3_mcbs.models import LocalEnvironments
+from sb3_mcbs.models.mujoco_batch import MujocoBatchModel
 from sb3_mcbs.snapshot import mujoco_warnings
 
 MODEL = mujoco.MjModel.from_xml_string(
@@ -65,13 +68,17 @@ def test_a_closed_stream_does_not_end_the_process(stream: Any, monkeypatch: pyte
 
 
 def test_simulations_on_other_threads_warn_and_go_on() -> None:
+    env = SnapshotEnvWrapper(gym.make("HalfCheetah-v5"))
+    env.reset(seed=0)
+    model = MujocoBatchModel(LocalEnvironments([env]), n_threads=4)
     mujoco.set_mju_user_warning(None)
     mujoco_warnings.show_warnings_once()
-    engine = BatchEngine(MODEL, 16, [], 4)
-    engine.state[:] = 1e20
-    diverged = engine.step(16, 2)
-    assert diverged is not None and diverged.all()
-    assert "huge value" in Path("MUJOCO_LOG.TXT").read_text()
+    env.unwrapped.data.qvel[:] = 1e20
+    model.set_roots(model.read_roots([0]), np.zeros(16, dtype=int), np.random.default_rng(0))
+    transition = model.step(np.zeros((16, 6), dtype=np.float32))
+    model.close()
+    assert not transition.valid.any()
+    assert Path("MUJOCO_LOG.TXT").read_text().count("huge value in QVEL") == 1
 
 
 def test_the_handler_of_somebody_else_stays() -> None:
