@@ -25,6 +25,7 @@ ARMS = (
     "MCBSTD3 (6,3,5)",
     "MCBSTD3 (6,3,5), medium",
     "MCBSTD3 (18,6,5)",
+    "MCBSTD3, HalfCheetah's entry",
     "the usual way (6,3,5)",
 )
 #: Arms that are also run with several environments.
@@ -121,8 +122,8 @@ def measure(
 def draw(results: list[dict[str, Any]]) -> None:
     """Where the time of a step goes, per arm and environment."""
     names = (
-        "simulate",
-        "networks in search",
+        "rollouts",
+        "networks outside of rollouts",
         "rest of choosing actions",
         "gradient",
         "environment",
