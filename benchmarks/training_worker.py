@@ -17,7 +17,7 @@ import numpy as np
 WARM_UP = 400
 SIZES = {"MCBSTD3 (6,3,5)": (6, 3, 5), "MCBSTD3 (6,3,1)": (6, 3, 1), "MCBSTD3 (18,6,5)": (18, 6, 5)}
 #: ``mcbs_td3.yml`` in HalfCheetah, but searching in half of the steps, not of the episodes: rounds are short.
-RECIPE = {"preset": "efficient", "search_share": 0.5, "value_expansion": 2}
+RECIPE: dict[str, Any] = {"preset": "efficient", "search_share": 0.5, "value_expansion": 2}
 
 
 def settings(n_envs: int) -> dict[str, Any]:
