@@ -18,7 +18,6 @@ from sb3_mcbs.models.mujoco_batch import usable_cores
 COMMITTED = Path(__file__).parent / "results"
 #: Where results go unless the command line says otherwise; git ignores it.
 DEFAULT_OUTPUT = Path("benchmark-results")
-NETWORKS = {"net_arch": [400, 300]}
 
 
 def machine() -> dict[str, str]:

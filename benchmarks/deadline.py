@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.env_util import make_vec_env
 
-from benchmarks.common import NETWORKS, machine, parse_args, print_table, write
+from benchmarks import NETWORKS
+from benchmarks.common import machine, parse_args, print_table, write
 from sb3_mcbs import MCBSTD3, SearchPolicy
 
 

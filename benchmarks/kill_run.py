@@ -15,7 +15,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecNormalize
 
-from benchmarks.common import NETWORKS
+from benchmarks import NETWORKS
 from sb3_mcbs import MCBSDDPG, MCBSSAC, MCBSTD3, MCBSTQC, MCBSCrossQ, SnapshotEnvWrapper
 from sb3_mcbs.checkpoints import ExactCheckpointCallback, resume
 from sb3_mcbs.networks.functions import STOCHASTIC

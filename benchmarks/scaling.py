@@ -13,8 +13,8 @@ import numpy as np
 from matplotlib import pyplot
 from stable_baselines3.common.env_util import make_vec_env
 
+from benchmarks import NETWORKS
 from benchmarks.common import (
-    NETWORKS,
     alternate,
     machine,
     parse_args,

@@ -19,8 +19,8 @@ from gymnasium.envs.mujoco import MujocoEnv
 from matplotlib import pyplot
 from mujoco.batch import Batch
 
+from benchmarks import NETWORKS
 from benchmarks.common import (
-    NETWORKS,
     alternate,
     machine,
     parse_args,

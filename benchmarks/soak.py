@@ -18,7 +18,8 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
-from benchmarks.common import NETWORKS, parse_args, print_table, write, write_picture
+from benchmarks import NETWORKS
+from benchmarks.common import parse_args, print_table, write, write_picture
 from sb3_mcbs import MCBSTD3, ExactCheckpointCallback, SnapshotEnvWrapper
 
 N_ENVS = 4

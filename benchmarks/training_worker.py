@@ -14,6 +14,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from benchmarks import NETWORKS
+
 WARM_UP = 400
 SIZES = {"MCBSTD3 (6,3,5)": (6, 3, 5), "MCBSTD3 (6,3,1)": (6, 3, 1), "MCBSTD3 (18,6,5)": (18, 6, 5)}
 #: ``mcbs_td3.yml`` in HalfCheetah, but searching in half of the steps, not of the episodes: rounds are short.
@@ -32,7 +34,7 @@ def settings(n_envs: int) -> dict[str, Any]:
         "train_freq": 1,
         "gradient_steps": -1 if n_envs > 1 else 1,
         "action_noise": NormalActionNoise(np.zeros(6), 0.1 * np.ones(6)),
-        "policy_kwargs": {"net_arch": [400, 300]},
+        "policy_kwargs": NETWORKS,
         "seed": 0,
     }
 
