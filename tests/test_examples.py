@@ -20,7 +20,7 @@ EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 SCRIPTS = sorted(EXAMPLES.glob("*.py"))
 NOTEBOOKS = sorted(EXAMPLES.glob("*.ipynb"))
 #: Numbers of the notebooks that make them quick.
-SMALL = {"STEPS": 510, "EPISODES": 1, "EPISODE_STEPS": 10, "VIDEO_STEPS": 5}
+SMALL = {"STEPS": 60, "EPISODES": 1, "EPISODE_STEPS": 10, "VIDEO_STEPS": 5}
 
 
 @pytest.fixture
