@@ -5,7 +5,7 @@ import pytest
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_mcbs import MCBSTD3, MCBSCrossQ
-from sb3_mcbs.agents.branches import Branches
+from sb3_mcbs.agents.branches import Branches, n_rollouts
 from sb3_mcbs.networks.functions import STOCHASTIC, target_actor
 from tests.conftest import SEARCHING, snapshot_vec_env
 from tests.test_value_expansion import GAMMA, STEPS, trained
@@ -118,6 +118,11 @@ def test_the_latest_transitions_are_kept(make_agent, monkeypatch):
     assert {row.tobytes() for row in np.concatenate(last[-3:])} <= held
 
 
+@pytest.mark.parametrize(("n_sampled", "n_steps", "n"), [(128, 2, 32), (128, 1, 64), (100, 3, 17), (1, 5, 1)])
+def test_transitions_are_used_twice(n_sampled, n_steps, n):
+    assert n_rollouts(n_sampled, n_steps) == n
+
+
 @pytest.mark.parametrize("cls", SEARCHING)
 def test_agents_learn_from_both_parts(make_agent, cls, monkeypatch):
     batches = []
@@ -135,7 +140,7 @@ def test_agents_learn_from_both_parts(make_agent, cls, monkeypatch):
     )
     assert len(batches) == agent._n_updates and all(len(batch.actions) == 8 for batch in batches)
     # 60 executed steps are simulated too, to compare them.
-    assert agent.n_simulated_steps == 60 + agent._n_updates * 8 * STEPS
+    assert agent.n_simulated_steps == 60 + agent._n_updates * n_rollouts(8, STEPS) * STEPS
     noisy = np.concatenate([batch.actions for batch in batches])
     exact = target_actor(agent)(batches[-1].observations.numpy(), KnownDraws())[0]
     assert abs(noisy).max() <= 1 and not np.allclose(noisy[-8:], exact, atol=1e-3), "actions are explored"

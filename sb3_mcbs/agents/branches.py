@@ -5,6 +5,7 @@ Rollouts branch off stored states and follow the current actor for some steps, a
 :data:`KEPT_UPDATES` gradient steps.
 """
 
+import math
 from operator import itemgetter
 from typing import Any, NamedTuple
 
@@ -18,8 +19,19 @@ from sb3_mcbs.types import Observations, map_arrays, put_rows, take_rows
 
 Samples = ReplayBufferSamples | DictReplayBufferSamples
 
+#: How often a transition is learned from, on average. Fewer uses cost simulated steps and brought nothing.
+USES = 2
 #: Gradient steps whose transitions are kept.
 KEPT_UPDATES = 400
+
+
+def n_rollouts(n_sampled: int, n_steps: int) -> int:
+    """How many rollouts go on side by side.
+
+    :param n_sampled: transitions that are sampled per gradient step.
+    :param n_steps: steps of each rollout per gradient step.
+    """
+    return math.ceil(n_sampled / (USES * n_steps))
 
 
 class _Step(NamedTuple):

@@ -20,7 +20,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples, RolloutReturn
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_mcbs.agents.branches import Branches, Samples
+from sb3_mcbs.agents.branches import Branches, Samples, n_rollouts
 from sb3_mcbs.agents.checked_rollouts import CheckedRollouts
 from sb3_mcbs.agents.planner import Planner
 from sb3_mcbs.agents.roots import Prediction
@@ -406,13 +406,13 @@ class Expanding(CheckedRollouts):
     def go_on_with_branches(self, n: int, env: VecNormalize | None) -> Branches | None:
         """Continue the simulated rollouts, which begin anew if a setting changed their shape.
 
-        :param n: how many.
+        :param n: how many transitions are sampled from them.
         :param env: normalises observations and rewards.
         :return: ``None`` without a ``branch_length``.
         """
         if not self.branch_length:
             return None
-        shape = n, self.value_expansion, self.branch_length
+        shape = n_rollouts(n, self.value_expansion), self.value_expansion, self.branch_length
         if self.branches is None or self.branches.shape != shape:
             self.branches = Branches(self.replay_buffer, *shape)
         assert self.rollout_rng is not None
