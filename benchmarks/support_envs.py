@@ -1,4 +1,4 @@
-"""Environments of the support table that are not made by their id alone: the doctor gets ``FILE:FUNCTION``."""
+"""Environments of the support table that an id alone does not make: the doctor gets ``FILE:FUNCTION``."""
 
 import importlib
 import tempfile
@@ -54,14 +54,14 @@ class PulledArm(MujocoEnv):
         data = self.data
         return np.concatenate([data.qpos, data.qvel, data.act, data.sensordata, data.mocap_pos[0]])
 
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, np.float64, bool, bool, dict[str, np.float64]]:
         """Move the guide, then simulate.
 
         :param action: speed of the guide, and the actuator's control.
         """
         self.data.mocap_pos[0, 2] = np.clip(self.data.mocap_pos[0, 2] + 0.01 * action[0], 0.3, 0.7)
         self.do_simulation(action[1:], self.frame_skip)
-        reward = -float(np.abs(self.data.site("tip").xpos[2] - 0.6))
+        reward = -np.abs(self.data.site("tip").xpos[2] - 0.6)
         return self._observe(), reward, False, False, {}
 
     def reset_model(self) -> np.ndarray:
