@@ -3,7 +3,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.sb3-mcbs-installed
 
-.PHONY: help install train test test-slow docs lint format clean
+.PHONY: help install train test test-slow docs lint format clean support-table
 .PHONY: bench-search bench-training bench-scaling bench-memory bench-deadline bench-gradient_step bench-kill bench-soak
 
 help:
@@ -13,6 +13,7 @@ help:
 	@echo "make docs       the documentation as a site, in docs/_build/html"
 	@echo "make lint       ruff and mypy"
 	@echo "make format     ruff format, and what ruff check can repair"
+	@echo "make support-table  docs/environments.md: which environments work, measured here"
 	@echo "make bench-search and other measurements: see docs/speed.md and docs/checkpoints.md"
 
 $(BIN)/python:
@@ -58,6 +59,19 @@ bench-search bench-scaling bench-memory bench-deadline bench-gradient_step bench
 
 bench-training: $(STAMP) .venv-sbx/bin/python
 	$(BIN)/python -m benchmarks.training --sbx-python .venv-sbx/bin/python
+
+# Environments of others need an older MuJoCo. What cannot be installed is a row that says so.
+.venv-support/bin/python: benchmarks/requirements-support.txt
+	$(PYTHON) -m venv .venv-support
+	grep -v mujoco constraints.txt > .venv-support/constraints.txt
+	.venv-support/bin/python -m pip install --quiet -c .venv-support/constraints.txt -e ".[box2d]" "mujoco<4"
+	grep -v '^#' $< | while read -r package; do \
+	    .venv-support/bin/python -m pip install --quiet -c .venv-support/constraints.txt $$package || \
+	    echo "not installed: $$package"; done
+	touch $@
+
+support-table: .venv-support/bin/python
+	.venv-support/bin/python -m benchmarks.support_table --page docs/environments.md
 
 clean:
 	rm -rf build dist docs/_build *.egg-info .pytest_cache .mypy_cache .ruff_cache

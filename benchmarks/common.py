@@ -74,10 +74,14 @@ def print_table(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
     print("| " + " | ".join(header) + " |")
     print("|" + "---|" * len(header))
     for row in rows:
-        print("| " + " | ".join(_shown(value) for value in row) + " |", flush=True)
+        print("| " + " | ".join(shown(value) for value in row) + " |", flush=True)
 
 
-def _shown(value: Any) -> str:
+def shown(value: Any) -> str:
+    """A cell of a table.
+
+    :param value: floats are shown with three significant digits, ``None`` as a dash.
+    """
     if value is None:
         return "-"
     if not isinstance(value, float):

@@ -134,3 +134,57 @@ def test_scaling_and_memory_and_deadline(monkeypatch):
     assert len(memory.over_decisions(agent, 10, 5)) == 3
     assert len(memory.over_training(agent, 10, 5)) == 3
     assert deadline.measure("Pendulum-v1", 0.05, 20)["candidates"] > 0
+
+
+SLOWLY = {
+    "snapshot": {
+        "captured_by": ["MjModelAdapter (model)", "MjDataAdapter"],
+        "replays": False,
+        "steps_compared": 9,
+    },
+    "forward_model": {"kind": "pool", "deterministic": True},
+    "costs": [{"preset": "paper", "milliseconds": 12.34}],
+    "hyperparameters": {"policy": "MultiInputPolicy", "preset": "efficient", "learning_rate": 1e-3},
+}
+
+
+def test_the_support_table_names_what_is_missing_and_what_fails(monkeypatch, tmp_path, capsys):
+    from benchmarks import support_table
+
+    Row = support_table.Row
+    rows = (
+        Row("Fetch-v4", also="HER"),
+        Row("Other-v0"),
+        Row("No-v0", package="not-a-package"),
+        Row("Bad-v0"),
+    )
+    examined = []
+
+    def examine(request, limit, on_stage):
+        examined.append(request.environment)
+        return {"problem": "It is broken."} if request.environment == "Bad-v0" else dict(SLOWLY)
+
+    monkeypatch.setattr(support_table, "ROWS", rows)
+    monkeypatch.setattr(support_table, "examine", examine)
+    monkeypatch.setattr(
+        support_table,
+        "block",
+        lambda found, *_: None if "problem" in found else json.dumps({"entry": found["hyperparameters"]}),
+    )
+    page = tmp_path / "page.md"
+    page.write_text(f"Before\n{support_table.BEGIN}\nold\n{support_table.END}\nafter\n")
+    run(monkeypatch, support_table, "--page", str(page))
+    assert examined == ["Fetch-v4", "Other-v0", "Bad-v0"]
+    text = page.read_text()
+    assert text.startswith("Before\n") and text.endswith("after\n") and "old" not in text
+    assert "| `Fetch-v4` | MuJoCo | copies | yes (9 steps) | 12.3 | A, `MultiInputPolicy`, HER |" in text
+    assert "| `Other-v0` | MuJoCo | copies | yes (9 steps) | 12.3 | A, `MultiInputPolicy` |" in text
+    assert "not installed: `pip install not-a-package`" in text
+    assert "no: It is broken." in text
+    assert "- **A** `{preset: efficient}`" in text
+    assert "| `Fetch-v4` |" in capsys.readouterr().out
+
+    page.write_text("no marks")
+    with pytest.raises(SystemExit, match="has no lines"):
+        run(monkeypatch, support_table, "--page", str(page), "--only", "No-v0")
+    assert page.read_text() == "no marks"

@@ -9,9 +9,10 @@ import pytest
 import torch as th
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_mcbs import MCBSDDPG, MCBSTD3, MCBSCrossQ
+from sb3_mcbs import MCBSDDPG, MCBSSAC, MCBSTD3, MCBSCrossQ
 from sb3_mcbs.agents.compiled_policy import CompiledPolicy
 from sb3_mcbs.agents.planner import Planner
+from sb3_mcbs.agents.value_expansion import ExpandedReplayBuffer
 from sb3_mcbs.models.compiled_networks import actions_of, values_of
 from sb3_mcbs.networks.functions import policy_function, value_function
 from sb3_mcbs.search import BeamSettings, CEMSettings, Roots, search
@@ -140,6 +141,36 @@ def test_the_log_says_which_way_rollouts_go_and_why(caplog: pytest.LogCaptureFix
     assert "Rollouts go step by step: ELU is not covered" in caplog.text
 
 
+DRAWN = "the actor draws its actions"
+TREE = "a tree chooses the branches that go on after every step"
+BUDGET = "time_budget may stop them between two steps"
+
+
+@pytest.mark.parametrize(
+    ("cls", "settings", "says"),
+    [
+        (MCBSTD3, {}, "rollouts are compiled"),
+        (MCBSTD3, {"strategy": "tree"}, f"rollouts go step by step: {TREE}"),
+        (MCBSTD3, {"search_kwargs": {"time_budget": 0.1}}, f"rollouts go step by step: {BUDGET}"),
+        (MCBSTD3, {"value_expansion": 2}, "rollouts are compiled; expanded targets are compiled"),
+        (
+            MCBSSAC,
+            {"value_expansion": 2},
+            f"rollouts are compiled; expanded targets go step by step: {DRAWN}",
+        ),
+        (MCBSTD3, {"forward_model": "pool"}, "pool of environment copies (deterministic dynamics)"),
+    ],
+)
+def test_the_first_line_says_which_way_rollouts_go_and_why(cls, settings, says, capsys, caplog) -> None:
+    agent = cls("MlpPolicy", "Hopper-v5", verbose=1, seed=0, **settings, **deepcopy(SMALL))
+    line = next(line for line in capsys.readouterr().out.splitlines() if "Forward model" in line)
+    assert line.endswith(says)
+    if "tree" in says or "budget" in says:
+        with caplog.at_level(logging.INFO, logger="sb3_mcbs"):
+            agent.planner.functions()
+        assert "Rollouts go step by step" in caplog.text
+
+
 @pytest.mark.parametrize("cls", [MCBSTD3, MCBSDDPG])
 @pytest.mark.parametrize("normalized", [False, True])
 def test_compiled_expansion_is_that_of_the_loop(cls, normalized, monkeypatch) -> None:
@@ -153,7 +184,7 @@ def test_compiled_expansion_is_that_of_the_loop(cls, normalized, monkeypatch) ->
     batches = []
     for compiled in (True, False):
         if not compiled:
-            monkeypatch.setattr(agent.planner, "compiled_policy", lambda target=False: None)
+            monkeypatch.setattr(ExpandedReplayBuffer, "_roll_forward_compiled", lambda *args: False)
         steps = agent.n_simulated_steps
         rng = np.random.default_rng(5)
         batch = agent.replay_buffer.sample_expanded(40, rng, agent.get_vec_normalize_env())

@@ -79,6 +79,14 @@ class CompiledPolicy:
         return self._view.reward_normalizer is normalizer and layers == ([] if env is None else [env])
 
 
+def way(reason: str) -> str:
+    """How rollouts go, in words.
+
+    :param reason: why they do not go in compiled code; empty: they do.
+    """
+    return f"go step by step: {reason}" if reason else "are compiled"
+
+
 def _rows(observations: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(observations, dtype=np.float64)
 

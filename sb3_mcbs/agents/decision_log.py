@@ -4,6 +4,13 @@ import time
 from typing import Any, NamedTuple
 
 import numpy as np
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    CallbackList,
+    ConvertCallback,
+    ProgressBarCallback,
+)
+from stable_baselines3.common.type_aliases import MaybeCallback
 
 from sb3_mcbs.search import BeamSettings, SearchResult, SearchSettings
 
@@ -24,6 +31,7 @@ def record_decision(agent: Any, result: SearchResult, seconds: float, settings: 
     searched = result.chosen >= 0
     values = result.values[searched]
     if values.size and np.isfinite(values).all():
+        agent.candidate_values.append(values)
         # In a tree the chosen root belongs to the best leaf, and need not have the best value.
         best = np.take_along_axis(values, result.chosen[searched][:, None], axis=1)[:, 0]
         agent.logger.record_mean("search/value_gain", float((best - values.mean(axis=1)).mean()))
@@ -73,3 +81,38 @@ class TrainingStart(NamedTuple):
             f"{agent.n_simulated_steps - self.simulated_steps:,} simulated steps; {searched:.0%} of the "
             "decisions were searched."
         )
+
+
+class SearchProgressBarCallback(ProgressBarCallback):
+    """SB3's progress bar, with the share of decisions that were searched and the milliseconds of one."""
+
+    def _on_training_start(self) -> None:
+        super()._on_training_start()
+        agent: Any = self.model
+        self._steps, self._decisions = agent.num_timesteps, agent.n_decisions
+        self._milliseconds = 0.0
+
+    def _on_step(self) -> bool:
+        agent: Any = self.model
+        n_decisions = agent.n_decisions - self._decisions
+        if n_decisions:
+            # The mean since the last table; a table takes it away.
+            known = self.logger.name_to_value
+            self._milliseconds = known.get("search/ms_per_decision", self._milliseconds)
+            share = n_decisions / (agent.num_timesteps - self._steps)
+            # tqdm shows no postfix where it draws with rich. 80 columns leave room for few words.
+            milliseconds = f"{self._milliseconds:.{0 if self._milliseconds >= 10 else 1}f}"
+            self.pbar.set_description_str(f"search {share:.0%}, {milliseconds} ms", refresh=False)
+        return super()._on_step()
+
+
+def with_progress_bar(callback: MaybeCallback) -> BaseCallback:
+    """Add a progress bar as SB3 does.
+
+    :param callback: an argument of ``learn``.
+    """
+    if isinstance(callback, list):
+        callback = CallbackList(callback)
+    if not isinstance(callback, BaseCallback):
+        callback = ConvertCallback(callback)
+    return CallbackList([callback, SearchProgressBarCallback()])

@@ -1,6 +1,7 @@
 """The mixin that makes an off-policy agent look ahead before it acts."""
 
 import time
+from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from copy import copy
 from typing import Any, ClassVar, TypeVar
@@ -12,7 +13,7 @@ from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_mcbs.agents.decision_log import TrainingStart, record_decision
+from sb3_mcbs.agents.decision_log import TrainingStart, record_decision, with_progress_bar
 from sb3_mcbs.agents.exploration import DrawnNoise, noise_without_search
 from sb3_mcbs.agents.faults import environment_named
 from sb3_mcbs.agents.hyperparameters import (
@@ -38,6 +39,7 @@ from sb3_mcbs.agents.planner import Planner
 from sb3_mcbs.agents.resumable import Resumable, Searching
 from sb3_mcbs.agents.roots import EnvironmentStep, Prediction
 from sb3_mcbs.agents.schedule import ScheduleSettings, SearchSchedule
+from sb3_mcbs.agents.tensorboard import write_candidates, write_hyperparameters
 from sb3_mcbs.agents.value_expansion import Expanding, ValueExpansionSettings
 from sb3_mcbs.networks.torch_settings import matmul_precision
 from sb3_mcbs.search import RecentActions, SearchResult, SearchSettings
@@ -72,6 +74,7 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
         "_states": "of the last step; computed again before they are read",
         "_checked_env": "a view of the environment",
         "_followed": "copies of settings",
+        "candidate_values": "only shown",
     }
     #: Set by ``sb3_mcbs.checkpoints``, which imports the agents, not the other way round.
     _resume_as: ClassVar[Callable[..., Any]]
@@ -97,6 +100,8 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
         self.n_invalid_rollouts = 0
         self.n_critic_evaluations = 0
         self.n_diverged_steps = 0
+        #: Of the decisions since the last log, at most the last 1000: ``[n_envs, candidates]``.
+        self.candidate_values: deque[np.ndarray] = deque(maxlen=1000)
         self.planner: Planner | None = None
         #: The search's prediction for the next executed actions.
         self._prediction: Prediction | None = None
@@ -189,7 +194,7 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
 
     def _say_what_simulates(self) -> None:
         if self.verbose >= 1 and self.planner is not None:
-            print(f"Forward model: {self.planner.description}")
+            print(f"Forward model: {self.planner.description}{self._expansion_in_words()}")
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         before = dict(vars(self))
@@ -341,7 +346,13 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
         result = super()._setup_learn(*args, **kwargs)
         if self._total_timesteps:  # the progress is still that of the previous training
             self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
+        write_hyperparameters(self)
         return result
+
+    def dump_logs(self) -> None:
+        """Write log data, and for TensorBoard a histogram of the candidates' values."""
+        write_candidates(self)
+        super().dump_logs()
 
     def _check_noise_after_search(self) -> None:
         if self.action_noise_after_search and self.action_noise is None:
@@ -385,7 +396,8 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
         :param log_interval: episodes between logs
         :param tb_log_name: the name of the run for TensorBoard logging; None: the name of the class
         :param reset_num_timesteps: whether or not to reset the current timestep number (used in logging)
-        :param progress_bar: Display a progress bar using tqdm and rich.
+        :param progress_bar: Display a progress bar using tqdm and rich, with the share of decisions that were
+            searched and the milliseconds of one.
         :return: the trained model
         """
         assert self.env is not None, "learn() needs an environment: call set_env()"
@@ -393,11 +405,11 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
             tb_log_name = type(self).__name__
         if self.planner is not None:
             self.planner.go_on_here()
+        if progress_bar:
+            callback = with_progress_bar(callback)
         begin = TrainingStart.of(self, reset_num_timesteps)
         with environment_named(self.env):
-            super().learn(
-                total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
-            )
+            super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps)
         if self.verbose >= 1:
             print(begin.summary(self))
         return self

@@ -12,7 +12,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_mcbs.agents.compiled_policy import CompiledPolicy
+from sb3_mcbs.agents.compiled_policy import CompiledPolicy, way
 from sb3_mcbs.agents.faults import InvalidDecisions, check_networks, is_finite
 from sb3_mcbs.agents.observation_pipeline import reward_normalizer
 from sb3_mcbs.agents.roots import EnvironmentStep, ExactRoots, LearnedRoots, Prediction, RootSource
@@ -112,8 +112,17 @@ class Planner:
 
     @property
     def description(self) -> str:
-        """One line that names the forward model."""
-        return "none: the critics rank the candidates" if self.model is None else self.model.description
+        """One line that names the forward model and, where that is the batch, says how rollouts go."""
+        if self.model is None:
+            return "none: the critics rank the candidates"
+        if self.model.kind != "mujoco":
+            return self.model.description
+        try:
+            self.compiled_policy()
+            reason = self.settings.why_by_steps
+        except TypeError as error:
+            reason = str(error)
+        return f"{self.model.description}; rollouts {way(reason)}"
 
     def plan(
         self,
@@ -308,32 +317,30 @@ class Planner:
         if self.source is None:
             policy, value = policy_function(self.agent), value_function(self.agent)
             return PolicyFunctions(policy, value, gamma, unscale, lambda rewards: rewards, self._act_dim)
-        view, compiled = self.source.view, self.compiled_policy()
-        if compiled is None:
+        try:
+            compiled = self.compiled_policy()
+        except TypeError as reason:
+            self._say(f"Rollouts {way(str(reason))}.")
             return self._plain_functions(unscale)
+        self._say(f"Rollouts {way(self.settings.why_by_steps)}.")
         return PolicyFunctions(
             compiled.policy,
             compiled.value,
             gamma,
             unscale,
-            view.scale_reward,
+            self.source.view.scale_reward,
             self._act_dim,
             compiled.rollout,
         )
 
-    def compiled_policy(self, target: bool = False) -> CompiledPolicy | None:
-        """The agent's current networks in compiled code; ``None`` where that does not cover them.
+    def compiled_policy(self, target: bool = False) -> CompiledPolicy:
+        """The agent's current networks in compiled code.
 
         :param target: the target actor, if there is one.
+        :raises TypeError: says what compiled code does not cover.
         """
         assert self.source is not None
-        try:
-            compiled = CompiledPolicy(self.agent, self.source.model, self.source.view, target)
-        except TypeError as reason:
-            self._say(f"Rollouts go step by step: {reason}.")
-            return None
-        self._say("Rollouts are compiled.")
-        return compiled
+        return CompiledPolicy(self.agent, self.source.model, self.source.view, target)
 
     def _plain_functions(self, unscale: Callable[[np.ndarray], np.ndarray]) -> PolicyFunctions:
         assert self.source is not None

@@ -22,6 +22,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_mcbs.agents.branches import Branches, Samples, n_rollouts
 from sb3_mcbs.agents.checked_rollouts import CheckedRollouts
+from sb3_mcbs.agents.compiled_policy import CompiledPolicy, way
 from sb3_mcbs.agents.planner import Planner
 from sb3_mcbs.agents.roots import Prediction
 from sb3_mcbs.models import ForwardModelError
@@ -248,11 +249,13 @@ class ExpandedReplayBuffer(ReplayBuffer):
         :return: False, and nothing is done, if that does not cover the agent.
         """
         agent = self.expanding_agent
-        compiled = None if isinstance(agent, STOCHASTIC) else agent.planner.compiled_policy(target=True)
-        if compiled is None or not compiled.normalizes_like(env):
+        try:
+            compiled = compiled_target(agent, env)
+        except TypeError:
             return False
         returns, lengths, terminated, last = path
-        rolled = compiled.follow(list(states), take_rows(last, going), agent.value_expansion)
+        begin: Any = take_rows(last, going)  # no dictionary: compiled code does not cover those
+        rolled = compiled.follow(list(states), begin, agent.value_expansion)
         agent.n_simulated_steps += rolled.simulated_steps
         returns[going] += agent.gamma * rolled.returns[:, 0]
         lengths[going] += rolled.lengths[:, 0]
@@ -361,6 +364,21 @@ class _Path(NamedTuple):
     observations: Observations
 
 
+def compiled_target(agent: Any, env: VecNormalize | None) -> CompiledPolicy:
+    """The current actor of the targets in compiled code.
+
+    :param agent: an :class:`~sb3_mcbs.MCBS` agent.
+    :param env: normalises the observations and rewards that it learns from.
+    :raises TypeError: says what compiled code does not cover.
+    """
+    if isinstance(agent, STOCHASTIC):
+        raise TypeError("the actor draws its actions")
+    compiled: CompiledPolicy = agent.planner.compiled_policy(target=True)
+    if not compiled.normalizes_like(env):
+        raise TypeError("they are not normalized as rollouts are")
+    return compiled
+
+
 def _joined(fields: Sequence[Any]) -> Any:
     if isinstance(fields[0], dict):
         return {key: th.cat([field[key] for field in fields]) for key in fields[0]}
@@ -429,6 +447,19 @@ class Expanding(CheckedRollouts):
         if self.value_expansion:
             assert self.replay_buffer is not None
             expand(self.replay_buffer, self)
+
+    def _expansion_in_words(self) -> str:
+        """How samples are rolled forward; empty if they are not."""
+        if not self.value_expansion:
+            return ""
+        if self.branch_length:
+            return f"; branches {way('every transition of theirs is kept')}"
+        try:
+            compiled_target(self, self.get_vec_normalize_env())
+            reason = ""
+        except TypeError as error:
+            reason = str(error)
+        return f"; expanded targets {way(reason)}"
 
     def _note_states(self) -> None:
         """Keep the environments' states before a step."""

@@ -202,5 +202,5 @@ def _how_to_be_faster(findings: dict[str, Any]) -> str:
         )
     return (
         "Simulating takes as long as the environment's own steps: make those faster, or if it simulates with "
-        "MuJoCo, give it a family (docs/forward_models.md)."
+        "MuJoCo, give it a family (docs/fast_path.md)."
     )

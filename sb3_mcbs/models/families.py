@@ -1,8 +1,8 @@
 """How environment classes compute observation, reward and termination, as functions of one row.
 
 A family is what :class:`~sb3_mcbs.models.mujoco_batch.MujocoBatchModel` needs to know about one environment
-class: plain Python functions of one simulation, which numba compiles. ``docs/forward_models.md`` shows step
-by step how to add one.
+class: plain Python functions of one simulation, which numba compiles. ``docs/fast_path.md`` shows step by
+step how to add one.
 """
 
 from collections.abc import Callable

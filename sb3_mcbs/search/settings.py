@@ -192,6 +192,11 @@ class SearchSettings(CheckedSettings, ABC):
         """Environment steps that a rollout simulates."""
         return self.rollout_depth * self.noise_hold
 
+    @property
+    def why_by_steps(self) -> str:
+        """Why rollouts are not simulated in one go; empty if they are."""
+        return ""
+
     def distinct_simulations(self, deterministic: bool) -> int:
         """The number of simulations of a candidate that can differ.
 

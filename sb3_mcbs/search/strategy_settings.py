@@ -54,6 +54,10 @@ class BeamSettings(SearchSettings):
                     "the two out."
                 )
 
+    @property
+    def why_by_steps(self) -> str:
+        return "" if self.time_budget is None else "time_budget may stop them between two steps"
+
     def distinct_simulations(self, deterministic: bool) -> int:
         # Only Algorithm 1 draws separate noise for each simulation.
         noisy = self.is_noisy(self.effective_rollout_noise)
@@ -99,6 +103,10 @@ class TreeSettings(SearchSettings):
                 f"n_proposals must be a multiple of beam_width={self.beam_width} with strategy='tree', since "
                 f"each node proposes equally many; got {self.n_proposals}."
             )
+
+    @property
+    def why_by_steps(self) -> str:
+        return "a tree chooses the branches that go on after every step"
 
     def simulated_steps(self, deterministic: bool = True) -> int:
         return self.beam_width * self.branching * self.distinct_simulations(deterministic) * self.horizon

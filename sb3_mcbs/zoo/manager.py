@@ -14,10 +14,12 @@ import optuna
 from optuna.storages import RDBStorage
 from rl_zoo3.exp_manager import ExperimentManager
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import ProgressBarCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_mcbs.agents.decision_log import SearchProgressBarCallback
 from sb3_mcbs.agents.hyperparameters import (
     GROUPS,
     MOVED,
@@ -276,6 +278,11 @@ class MCBSExperimentManager(ExperimentManager):
                     )
                 callback.path = Path(self.save_path) / CHECKPOINTS
         super().create_callbacks()
+        if self.algo in SEARCHING:
+            self.callbacks = [
+                SearchProgressBarCallback() if type(each) is ProgressBarCallback else each
+                for each in self.callbacks
+            ]
         index = next((i for i, cb in enumerate(self.callbacks) if isinstance(cb, SearchEvalCallback)), None)
         if index is None or (self.algo not in SEARCHING and self.search_evaluation is None):
             return
