@@ -75,6 +75,16 @@ def test_files_added_to_a_wheel_are_recorded(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [wheel]
 
 
+def test_type_checkers_find_what_make_installed(tmp_path: Path) -> None:
+    """They look for folders on the import path, and do not run the import hooks of editable packages."""
+    code = "from importlib.machinery import PathFinder; print(PathFinder.find_spec('sb3_mcbs').origin)"
+    alone = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False, env=alone
+    )
+    assert done.returncode == 0 and Path(done.stdout.strip()).with_name("py.typed").is_file(), done.stderr
+
+
 class Environment:
     """A virtual environment that sees the packages of the present one, but not this project."""
 
@@ -142,6 +152,23 @@ def test_installation_registers_in_any_folder(installed: Environment, tmp_path: 
     assert Path(file).is_file() and ROOT not in Path(file).parents
     off = "import rl_zoo3; print('mcbs_td3' in rl_zoo3.ALGOS)"
     assert installed.run("-c", off, cwd=tmp_path, SB3_MCBS_NO_ZOO_HOOK="1").strip() == "False"
+
+
+@pytest.mark.slow
+def test_scripts_of_users_are_type_checked(installed: Environment, tmp_path: Path) -> None:
+    (tmp_path / "script.py").write_text(
+        "from sb3_mcbs import MCBSTD3, SearchPolicy\n"
+        "def search(policy: SearchPolicy) -> None:\n"
+        "    reveal_type(policy.beam_width)\n"
+        "    reveal_type(policy.predict)\n"
+        'MCBSTD3("MlpPolicy", "Pendulum-v1", strategy="beem")\n'
+    )
+    words = [sys.executable, "-m", "mypy", "--python-executable", installed.python, "script.py"]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert 'script.py:3: note: Revealed type is "int"' in done.stdout, done.stdout + done.stderr
+    assert 'script.py:4: note: Revealed type is "def (observation' in done.stdout
+    assert 'script.py:5: error: Argument "strategy" to "MCBSTD3" has incompatible type' in done.stdout
+    assert "Found 1 error" in done.stdout
 
 
 @pytest.mark.slow
