@@ -36,16 +36,49 @@ def pins() -> dict[str, str]:
 
 def test_every_dependency_is_open_in_the_metadata_and_pinned_in_the_constraints(pins: dict[str, str]) -> None:
     project = METADATA["project"]
-    requirements = [*project["dependencies"], *chain(*project["optional-dependencies"].values())]
+    extras = chain(*project["optional-dependencies"].values())
+    requirements = [*project["dependencies"], *(each for each in extras if not each.startswith("sb3-mcbs["))]
     assert not [requirement for requirement in requirements if "==" in requirement or "<" in requirement]
     assert {normalised(requirement) for requirement in requirements} <= set(pins)
     assert pins["torch"] == "2.13.0"
 
 
 def test_commands_of_rl_zoo_find_what_they_import() -> None:
-    assert {normalised(entry) for entry in METADATA["project"]["dependencies"]} >= UNDECLARED_BY_RL_ZOO
+    zoo = {normalised(entry) for entry in METADATA["project"]["optional-dependencies"]["zoo"]}
+    plain = {normalised(entry) for entry in METADATA["project"]["dependencies"]}
+    assert zoo | plain >= UNDECLARED_BY_RL_ZOO and not zoo & plain
     plots = {normalised(entry) for entry in METADATA["project"]["optional-dependencies"]["plots"]}
     assert plots >= {"rliable", "scipy", "seaborn"}
+
+
+def test_without_rl_zoo_its_commands_say_what_to_install_and_the_others_work(tmp_path: Path) -> None:
+    zoo = [
+        normalised(entry).replace("-", "_") for entry in METADATA["project"]["optional-dependencies"]["zoo"]
+    ]
+    hidden = {*zoo, "huggingface_hub", "huggingface_sb3"} - {"jinja2"}  # torch brings its own jinja2
+    code = (
+        f"import sys; sys.modules.update(dict.fromkeys({sorted(hidden)}))\n"
+        "from sb3_mcbs import cli\n"
+        "for words in sys.argv[1:]:\n"
+        "    sys.argv = ['sb3-mcbs', *words.split()]\n"
+        "    try:\n"
+        "        cli.main()\n"
+        "    except SystemExit as end:\n"
+        "        print(end)"
+    )
+    works = ("doctor", "evaluate", "watch", "convert-statistics")
+    needs = ("train", "experiment", "resume", "report")
+    words = ["--version", *(f"{command} --help" for command in works), *needs]
+    done = subprocess.run(
+        [sys.executable, "-c", code, *words], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.stdout.startswith("sb3-mcbs "), done.stdout + done.stderr
+    for command in works:
+        assert f"usage: sb3-mcbs {command}" in done.stdout
+    for command in needs:
+        assert re.search(
+            rf"^sb3-mcbs {command}: .*: pip install 'sb3-mcbs\[zoo\]'$", done.stdout, re.MULTILINE
+        )
 
 
 def test_pth_line_survives_whatever_goes_wrong(tmp_path: Path) -> None:
