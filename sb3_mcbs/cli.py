@@ -17,6 +17,8 @@ COMMANDS = {
         "a page with curves and numbers of all runs of a folder",
     ),
     "watch": ("sb3_mcbs.zoo.watch", "a video of an agent and of what its search looks at"),
+    "export": ("sb3_mcbs.zoo.export", "an agent's networks as ONNX files"),
+    "push": ("sb3_mcbs.zoo.push", "an agent to the Hugging Face hub, with both returns"),
     "convert-statistics": ("sb3_mcbs.zoo.convert_statistics", "write a trusted vecnormalize.pkl as npz"),
 }
 

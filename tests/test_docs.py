@@ -45,7 +45,18 @@ DOCS = ROOT / "docs"
 BESIDE = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md", "CHANGELOG.md")]
 PAGES = [*BESIDE, *sorted(path for path in DOCS.rglob("*.md") if "_build" not in path.parts)]
 #: The sub-packages that users import from.
-PACKAGES = ["agents", "checkpoints", "experiments", "loading", "models", "search", "snapshot", "video", "zoo"]
+PACKAGES = [
+    "agents",
+    "checkpoints",
+    "experiments",
+    "loading",
+    "models",
+    "search",
+    "sharing",
+    "snapshot",
+    "video",
+    "zoo",
+]
 COMMAND = re.compile(r"(?:python3? -m [\w.]+|sb3-mcbs [\w-]+|make [\w-]+)(?=\s|$).*")
 
 
@@ -115,12 +126,20 @@ def untrained_agent(repo: str, filename: str) -> str:
     return filename
 
 
+def untrained_repository(repo: str, **_: object) -> str:
+    """The same for a whole repository."""
+    Path(repo).mkdir(parents=True, exist_ok=True)
+    untrained_agent(repo, f"{repo}/agent.zip")
+    return repo
+
+
 @pytest.mark.parametrize("path", pages_with("python"))
 def test_the_code_of_a_page_runs(
     path: Path, tmp_path: Path, nothing_stays_registered: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(huggingface_hub, "hf_hub_download", untrained_agent)
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", untrained_repository)
     module = types.ModuleType(re.sub(r"\W", "_", f"page_{name_of(path)}"))
     monkeypatch.setitem(sys.modules, module.__name__, module)
     for block in blocks_of(path, "python"):

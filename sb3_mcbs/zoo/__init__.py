@@ -5,7 +5,7 @@ from types import ModuleType
 
 from sb3_mcbs.zoo.paths import hyperparams_path
 
-__all__ = ["MissingZooError", "hyperparams_path", "import_with_zoo", "register"]
+__all__ = ["MissingZooError", "hyperparams_path", "register"]
 
 #: Packages of the extra ``zoo`` that this package imports itself.
 _OF_ZOO = ("jinja2", "optuna", "rich", "rl_zoo3")
