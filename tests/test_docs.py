@@ -19,6 +19,7 @@ import re
 import runpy
 import shlex
 import sys
+import tomllib
 import types
 from collections.abc import Iterator
 from dataclasses import fields
@@ -57,6 +58,11 @@ PACKAGES = [
     "video",
     "zoo",
 ]
+#: Where absolute links lead to files of the checkout.
+ON_GITHUB = (
+    "https://github.com/sb3-mcbs/sb3-mcbs/blob/main/",
+    "https://raw.githubusercontent.com/sb3-mcbs/sb3-mcbs/main/",
+)
 COMMAND = re.compile(r"(?:python3? -m [\w.]+|sb3-mcbs [\w-]+|make [\w-]+)(?=\s|$).*")
 
 
@@ -216,12 +222,24 @@ def anchors_of(path: Path) -> set[str]:
 @pytest.mark.parametrize("path", PAGES, ids=name_of)
 def test_links_lead_somewhere(path: Path) -> None:
     text = re.sub(r"(```|~~~).*?\1|`[^`\n]*`", "", path.read_text(encoding="utf-8"), flags=re.DOTALL)
-    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+    for pair in re.findall(r"\]\(([^)\s]+)\)|^\[[^\]]+\]: (\S+)", text, flags=re.MULTILINE):
+        target, folder = "".join(pair), path.parent
+        for address in ON_GITHUB:
+            if target.startswith(address):
+                target, folder = target.removeprefix(address), ROOT
         name, _, anchor = target.partition("#")
         if "://" not in target and not target.startswith("mailto:"):
-            file = (path.parent / name).resolve() if name else path
+            file = (folder / name).resolve() if name else path
             assert file.exists(), target
             assert not anchor or anchor in anchors_of(file), target
+
+
+def test_links_of_the_readme_are_absolute_as_pypi_needs_them() -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    links = re.findall(r"\]\(([^)\s]+)\)|^\[[^\]]+\]: (\S+)", text, flags=re.MULTILINE)
+    assert not [pair for pair in links if not "".join(pair).startswith("https://")]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert ON_GITHUB[0].startswith(project["urls"]["Source"])
 
 
 def texts_of_the_code() -> str:

@@ -26,6 +26,11 @@ class _Graph(nn.Module):
     :param normalizer: normalises its observations, or None.
     """
 
+    low: th.Tensor
+    half_range: th.Tensor
+    mean: th.Tensor
+    deviation: th.Tensor
+
     def __init__(self, agent: Any, normalizer: VecNormalize | None) -> None:
         super().__init__()
         self.stochastic, self.quantiles = isinstance(agent, STOCHASTIC), isinstance(agent, TQC)
