@@ -2,6 +2,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.sb3-mcbs-installed
+EXTRAS := dev,docs,zoo,plots,box2d,tuning,ray,report,video,hub,onnx
 
 .PHONY: help install train test test-slow docs lint format clean support-table
 .PHONY: bench-search bench-training bench-scaling bench-memory bench-deadline bench-gradient_step bench-kill bench-soak
@@ -21,7 +22,7 @@ $(BIN)/python:
 
 # The hook that RL Zoo needs is written at installation, so a change to it installs again.
 $(STAMP): $(BIN)/python pyproject.toml setup.cfg constraints.txt _sb3_mcbs_build.py _sb3_mcbs_hook.py
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e ".[dev,docs,plots,box2d,tuning,ray,report,video]"
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e ".[$(EXTRAS)]"
 	touch $@
 
 install: $(STAMP)

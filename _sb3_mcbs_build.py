@@ -15,7 +15,6 @@ from setuptools.command.build_py import build_py
 from setuptools.command.editable_wheel import editable_wheel
 
 PTH_NAME = "_sb3_mcbs_hook.pth"
-HOOK_NAME = "_sb3_mcbs_hook.py"
 # One line, as a .pth file wants it. Whatever goes wrong (an editable checkout that was moved away, for one)
 # must not show up at the start of every interpreter.
 PTH_LINE = 'import os; exec("try:\\n    import _sb3_mcbs_hook\\nexcept Exception:\\n    pass")\n'
@@ -53,22 +52,16 @@ class BuildPy(build_py):
 
 
 class EditableWheel(editable_wheel):
-    """
-    Adds the ``.pth`` file to the wheel that ``pip install -e`` installs.
-
-    The hook module goes with it: through setuptools' own finder for editable packages, finding it would take
-    several times as long at every interpreter start.
-    """
+    """Adds the ``.pth`` file to the wheel that ``pip install -e`` installs."""
 
     def run(self) -> None:
-        """Let setuptools make the wheel, then write it again with our files in its root."""
+        """Let setuptools make the wheel, then write it again with our file in its root."""
         folder = Path(self.dist_dir)
         before = {path: path.stat().st_mtime_ns for path in folder.glob("*.whl")}
         super().run()
-        files = {PTH_NAME: PTH_LINE.encode(), HOOK_NAME: (ROOT / HOOK_NAME).read_bytes()}
         for path in folder.glob("*.whl"):
             if before.get(path) != path.stat().st_mtime_ns:
-                add_to_wheel(path, files)
+                add_to_wheel(path, {PTH_NAME: PTH_LINE.encode()})
 
 
 def add_to_wheel(path: Path, files: dict[str, bytes]) -> None:

@@ -46,7 +46,7 @@ def _warn(name: str, error: Exception) -> None:
             "MUJOCO_GL to do without pictures"
         )
     else:
-        advice = "Repair the installation (pip install --force-reinstall sb3-mcbs)"
+        advice = "Repair the installation (pip install --force-reinstall 'sb3-mcbs[zoo]')"
     if _is_asked_for():
         raise SystemExit(f"{failure}. {advice}.")
     warnings.warn(

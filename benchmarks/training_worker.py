@@ -74,8 +74,7 @@ def make_agent(arm: str, env_id: str, n_envs: int) -> Any:
     return MCBSTD3(
         "MlpPolicy",
         env,
-        **common,
-        matmul_precision=precision or None,
+        **{**common, "matmul_precision": precision or None},
         beam_width=beam_width,
         rollout_depth=rollout_depth,
         n_simulations=n_simulations,

@@ -8,6 +8,7 @@ from sb3_mcbs.checkpoints import CheckpointError, ExactCheckpointCallback, resum
 from sb3_mcbs.loading import AgentFileError, load_agent, load_statistics, save_statistics
 from sb3_mcbs.models import WorkerError
 from sb3_mcbs.search import BeamSettings, CEMSettings, SearchSettings, TreeSettings
+from sb3_mcbs.sharing import export_onnx, load_from_hub, push_to_hub
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 from sb3_mcbs.snapshot.mujoco_warnings import show_warnings_once
 
@@ -38,8 +39,11 @@ __all__ = [
     "TreeSettings",
     "WorkerError",
     "__version__",
+    "export_onnx",
     "load_agent",
+    "load_from_hub",
     "load_statistics",
+    "push_to_hub",
     "resume",
     "save_statistics",
 ]

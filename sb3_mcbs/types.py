@@ -8,15 +8,21 @@ model does is visible in a real environment.
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
 #: One array ``[rows, *shape]``, or one per key for a Dict observation space.
 Observations = np.ndarray | dict[str, np.ndarray]
 
-
-BACKENDS = ("auto", "mujoco", "pool", "ensemble")
+# Names of choices, for type checkers. What a command or an error lists comes from the same place.
+Strategy = Literal["beam", "tree", "cem"]
+Preset = Literal["paper", "efficient", "balanced", "strong"]
+Backend = Literal["auto", "mujoco", "pool", "ensemble"]
+ScheduleName = Literal["constant", "saturation", "anneal"]
+SearchUnit = Literal["step", "episode"]
+MatmulPrecision = Literal["highest", "high", "medium"]
+BACKENDS: tuple[Backend, ...] = get_args(Backend)
 
 
 class Transition(NamedTuple):

@@ -33,6 +33,13 @@ def untrained_agent(repo: str, filename: str) -> str:
     return filename
 
 
+def untrained_repository(repo: str, **_: object) -> str:
+    """The same for a whole repository of the hub."""
+    Path(repo).mkdir(parents=True, exist_ok=True)
+    untrained_agent(repo, f"{repo}/agent.zip")
+    return repo
+
+
 def assert_same_agent(loaded, other, n=64):
     """Actions and values are equal to the bit."""
     space = other.observation_space

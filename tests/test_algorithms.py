@@ -2,7 +2,7 @@
 
 import inspect
 import re
-from typing import get_type_hints
+from typing import get_args, get_type_hints
 
 import pytest
 
@@ -11,7 +11,9 @@ from sb3_mcbs.agents import EnsembleSettings, ScheduleSettings
 from sb3_mcbs.agents.hyperparameters import SETTINGS
 from sb3_mcbs.agents.value_expansion import ValueExpansionSettings
 from sb3_mcbs.networks.td3_update import FastUpdate
+from sb3_mcbs.search import PRESETS
 from sb3_mcbs.search.settings import STRATEGIES
+from sb3_mcbs.types import Preset, Strategy
 from tests.conftest import SEARCHING, SMALL_SEARCH, WITHOUT_SEARCH
 
 #: What a preset may say: ``None`` in signatures.
@@ -21,6 +23,11 @@ OF_PRESETS = {"beam_width", "rollout_depth", "n_simulations", "beam_noise", "str
 def keywords(cls) -> list[str]:
     """The parameters that are not SB3's."""
     return [*SETTINGS, *(["fast_update"] if issubclass(cls, FastUpdate | MCBSCrossQ) else [])]
+
+
+def test_type_checkers_know_all_names():
+    assert get_args(Preset) == tuple(PRESETS)
+    assert set(get_args(Strategy)) == set(STRATEGIES)
 
 
 @pytest.mark.parametrize("cls", SEARCHING)

@@ -19,6 +19,7 @@ import re
 import runpy
 import shlex
 import sys
+import tomllib
 import types
 from collections.abc import Iterator
 from dataclasses import fields
@@ -39,14 +40,30 @@ from sb3_mcbs.agents.registry import ALGORITHMS
 from sb3_mcbs.models import families
 from sb3_mcbs.search import PRESETS, BeamSettings, CEMSettings, SearchSettings, TreeSettings
 from sb3_mcbs.search.settings import KEYWORDS, STRATEGIES
-from tests.agent_files import untrained_agent
+from tests.agent_files import untrained_agent, untrained_repository
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 BESIDE = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md", "CHANGELOG.md")]
 PAGES = [*BESIDE, *sorted(path for path in DOCS.rglob("*.md") if "_build" not in path.parts)]
 #: The sub-packages that users import from.
-PACKAGES = ["agents", "checkpoints", "experiments", "loading", "models", "search", "snapshot", "video", "zoo"]
+PACKAGES = [
+    "agents",
+    "checkpoints",
+    "experiments",
+    "loading",
+    "models",
+    "search",
+    "sharing",
+    "snapshot",
+    "video",
+    "zoo",
+]
+#: Where absolute links lead to files of the checkout.
+ON_GITHUB = (
+    "https://github.com/sb3-mcbs/sb3-mcbs/blob/main/",
+    "https://raw.githubusercontent.com/sb3-mcbs/sb3-mcbs/main/",
+)
 COMMAND = re.compile(r"(?:python3? -m [\w.]+|sb3-mcbs [\w-]+|make [\w-]+)(?=\s|$).*")
 
 
@@ -115,6 +132,7 @@ def test_the_code_of_a_page_runs(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(huggingface_hub, "hf_hub_download", untrained_agent)
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", untrained_repository)
     module = types.ModuleType(re.sub(r"\W", "_", f"page_{name_of(path)}"))
     monkeypatch.setitem(sys.modules, module.__name__, module)
     for block in blocks_of(path, "python"):
@@ -191,12 +209,24 @@ def anchors_of(path: Path) -> set[str]:
 @pytest.mark.parametrize("path", PAGES, ids=name_of)
 def test_links_lead_somewhere(path: Path) -> None:
     text = re.sub(r"(```|~~~).*?\1|`[^`\n]*`", "", path.read_text(encoding="utf-8"), flags=re.DOTALL)
-    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+    for pair in re.findall(r"\]\(([^)\s]+)\)|^\[[^\]]+\]: (\S+)", text, flags=re.MULTILINE):
+        target, folder = "".join(pair), path.parent
+        for address in ON_GITHUB:
+            if target.startswith(address):
+                target, folder = target.removeprefix(address), ROOT
         name, _, anchor = target.partition("#")
         if "://" not in target and not target.startswith("mailto:"):
-            file = (path.parent / name).resolve() if name else path
+            file = (folder / name).resolve() if name else path
             assert file.exists(), target
             assert not anchor or anchor in anchors_of(file), target
+
+
+def test_links_of_the_readme_are_absolute_as_pypi_needs_them() -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    links = re.findall(r"\]\(([^)\s]+)\)|^\[[^\]]+\]: (\S+)", text, flags=re.MULTILINE)
+    assert not [pair for pair in links if not "".join(pair).startswith("https://")]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert ON_GITHUB[0].startswith(project["urls"]["Source"])
 
 
 def texts_of_the_code() -> str:

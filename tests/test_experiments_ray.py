@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from sb3_mcbs import __version__
 from sb3_mcbs.checkpoints.store import Store
 from sb3_mcbs.experiments.results import RunFolder
 from tests.experiment_helpers import (
@@ -212,7 +213,8 @@ def test_a_node_with_other_sources_is_refused(cluster: Cluster, undisturbed: Pat
     words = ["--engine", "ray", "--address", cluster.address]
     runner = begin(spec_file(tmp_path, **LONGER), tmp_path / "results", *words)
     text, _ = runner.communicate(timeout=300)
-    assert runner.returncode == 0 and text.count("is refused: it has sb3-mcbs 0.1.0 (sources") == 1, text
+    refusal = f"is refused: it has sb3-mcbs {__version__} (sources"
+    assert runner.returncode == 0 and text.count(refusal) == 1, text
     for each in NAMES:
         assert_equal(folder_of(tmp_path / "results", each), folder_of(undisturbed, each))
 

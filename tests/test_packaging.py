@@ -36,16 +36,49 @@ def pins() -> dict[str, str]:
 
 def test_every_dependency_is_open_in_the_metadata_and_pinned_in_the_constraints(pins: dict[str, str]) -> None:
     project = METADATA["project"]
-    requirements = [*project["dependencies"], *chain(*project["optional-dependencies"].values())]
+    extras = chain(*project["optional-dependencies"].values())
+    requirements = [*project["dependencies"], *(each for each in extras if not each.startswith("sb3-mcbs["))]
     assert not [requirement for requirement in requirements if "==" in requirement or "<" in requirement]
     assert {normalised(requirement) for requirement in requirements} <= set(pins)
     assert pins["torch"] == "2.13.0"
 
 
 def test_commands_of_rl_zoo_find_what_they_import() -> None:
-    assert {normalised(entry) for entry in METADATA["project"]["dependencies"]} >= UNDECLARED_BY_RL_ZOO
+    zoo = {normalised(entry) for entry in METADATA["project"]["optional-dependencies"]["zoo"]}
+    plain = {normalised(entry) for entry in METADATA["project"]["dependencies"]}
+    assert zoo | plain >= UNDECLARED_BY_RL_ZOO and not zoo & plain
     plots = {normalised(entry) for entry in METADATA["project"]["optional-dependencies"]["plots"]}
     assert plots >= {"rliable", "scipy", "seaborn"}
+
+
+def test_without_rl_zoo_its_commands_say_what_to_install_and_the_others_work(tmp_path: Path) -> None:
+    zoo = [
+        normalised(entry).replace("-", "_") for entry in METADATA["project"]["optional-dependencies"]["zoo"]
+    ]
+    hidden = {*zoo, "huggingface_hub", "huggingface_sb3"} - {"jinja2"}  # torch brings its own jinja2
+    code = (
+        f"import sys; sys.modules.update(dict.fromkeys({sorted(hidden)}))\n"
+        "from sb3_mcbs import cli\n"
+        "for words in sys.argv[1:]:\n"
+        "    sys.argv = ['sb3-mcbs', *words.split()]\n"
+        "    try:\n"
+        "        cli.main()\n"
+        "    except SystemExit as end:\n"
+        "        print(end)"
+    )
+    works = ("doctor", "evaluate", "watch", "convert-statistics")
+    needs = ("train", "experiment", "resume", "report")
+    words = ["--version", *(f"{command} --help" for command in works), *needs]
+    done = subprocess.run(
+        [sys.executable, "-c", code, *words], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.stdout.startswith("sb3-mcbs "), done.stdout + done.stderr
+    for command in works:
+        assert f"usage: sb3-mcbs {command}" in done.stdout
+    for command in needs:
+        assert re.search(
+            rf"^sb3-mcbs {command}: .*: pip install 'sb3-mcbs\[zoo\]'$", done.stdout, re.MULTILINE
+        )
 
 
 def test_pth_line_survives_whatever_goes_wrong(tmp_path: Path) -> None:
@@ -73,6 +106,16 @@ def test_files_added_to_a_wheel_are_recorded(tmp_path: Path) -> None:
         record = archive.read("a-1.dist-info/RECORD").decode().splitlines()
         assert "a.pth,sha256=BrJAlXgrDEe7igFhXyMQkumY_81HoRQgLOdTAVv42f4,9" in record
     assert list(tmp_path.iterdir()) == [wheel]
+
+
+def test_type_checkers_find_what_make_installed(tmp_path: Path) -> None:
+    """They look for folders on the import path, and do not run the import hooks of editable packages."""
+    code = "from importlib.machinery import PathFinder; print(PathFinder.find_spec('sb3_mcbs').origin)"
+    alone = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False, env=alone
+    )
+    assert done.returncode == 0 and Path(done.stdout.strip()).with_name("py.typed").is_file(), done.stderr
 
 
 class Environment:
@@ -142,6 +185,23 @@ def test_installation_registers_in_any_folder(installed: Environment, tmp_path: 
     assert Path(file).is_file() and ROOT not in Path(file).parents
     off = "import rl_zoo3; print('mcbs_td3' in rl_zoo3.ALGOS)"
     assert installed.run("-c", off, cwd=tmp_path, SB3_MCBS_NO_ZOO_HOOK="1").strip() == "False"
+
+
+@pytest.mark.slow
+def test_scripts_of_users_are_type_checked(installed: Environment, tmp_path: Path) -> None:
+    (tmp_path / "script.py").write_text(
+        "from sb3_mcbs import MCBSTD3, SearchPolicy\n"
+        "def search(policy: SearchPolicy) -> None:\n"
+        "    reveal_type(policy.beam_width)\n"
+        "    reveal_type(policy.predict)\n"
+        'MCBSTD3("MlpPolicy", "Pendulum-v1", strategy="beem")\n'
+    )
+    words = [sys.executable, "-m", "mypy", "--python-executable", installed.python, "script.py"]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert 'script.py:3: note: Revealed type is "int"' in done.stdout, done.stdout + done.stderr
+    assert 'script.py:4: note: Revealed type is "def (observation' in done.stdout
+    assert 'script.py:5: error: Argument "strategy" to "MCBSTD3" has incompatible type' in done.stdout
+    assert "Found 1 error" in done.stdout
 
 
 @pytest.mark.slow

@@ -19,7 +19,19 @@ MAY_IMPORT = {
     "loading": ["types", "snapshot", "models", "search", "networks", "agents"],
     "checkpoints": ["types", "snapshot", "models", "search", "networks", "agents"],
     "video": ["types", "snapshot", "models", "search", "networks", "agents"],
-    "zoo": ["types", "snapshot", "models", "search", "networks", "agents", "loading", "checkpoints", "video"],
+    "sharing": ["types", "snapshot", "models", "search", "networks", "agents", "loading"],
+    "zoo": [
+        "types",
+        "snapshot",
+        "models",
+        "search",
+        "networks",
+        "agents",
+        "loading",
+        "checkpoints",
+        "video",
+        "sharing",
+    ],
 }
 MAY_IMPORT["experiments"] = [*MAY_IMPORT["zoo"], "zoo"]
 MAY_IMPORT["doctor"] = [*MAY_IMPORT["zoo"], "zoo"]

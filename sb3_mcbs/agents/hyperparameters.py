@@ -15,6 +15,7 @@ from sb3_mcbs.agents.value_expansion import ValueExpansionSettings
 from sb3_mcbs.search import BeamSettings, SearchSettings, make_settings, with_preset
 from sb3_mcbs.search.checks import as_dict
 from sb3_mcbs.search.settings import OF_THE_MACHINE, STRATEGIES, present_name
+from sb3_mcbs.types import Backend, MatmulPrecision, Preset, ScheduleName, SearchUnit, Strategy
 
 #: An agent's constructor parameters besides SB3's, and their defaults without a preset. The agent has them as
 #: attributes. ``None`` is a dictionary without keys.
@@ -198,7 +199,7 @@ def group_flat(attributes: dict[str, Any]) -> None:
             attributes[group] = values
 
 
-def settings_of_preset(name: str) -> dict[str, Any]:
+def settings_of_preset(name: Preset) -> dict[str, Any]:
     """The settings that a preset replaces in an existing agent or a hyperparameter file.
 
     :param name: one of :data:`~sb3_mcbs.search.PRESETS`.
@@ -248,20 +249,20 @@ class SearchAttributes(RefusesOldNames):
     rollout_depth: int
     n_simulations: int
     beam_noise: float
-    strategy: str
+    strategy: Strategy
     search_kwargs: dict[str, Any] | None
-    preset: str | None
-    search_schedule: str
+    preset: Preset | None
+    search_schedule: ScheduleName
     search_share: float
-    search_unit: str
+    search_unit: SearchUnit
     schedule_kwargs: dict[str, Any] | None
-    forward_model: str
+    forward_model: Backend
     model_kwargs: dict[str, Any] | None
     value_expansion: int
     expanded_share: float
     branch_length: int
     action_noise_after_search: bool
-    matmul_precision: str | None
+    matmul_precision: MatmulPrecision | None
     #: Contents of the dictionaries at the last check.
     _followed: list[dict[str, Any] | None]
 

@@ -12,6 +12,7 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from sb3_mcbs.agents.hyperparameters import sb3_arguments
 from sb3_mcbs.agents.mcbs import MCBS
 from sb3_mcbs.networks.batch_renorm import fuse_batch_renorm
+from sb3_mcbs.types import Backend, MatmulPrecision, Preset, ScheduleName, SearchUnit, Strategy
 
 
 class MCBSCrossQ(MCBS, CrossQ):
@@ -100,20 +101,20 @@ class MCBSCrossQ(MCBS, CrossQ):
         rollout_depth: int | None = None,
         n_simulations: int | None = None,
         beam_noise: float | None = None,
-        strategy: str | None = None,
+        strategy: Strategy | None = None,
         search_kwargs: dict[str, Any] | None = None,
-        preset: str | None = None,
-        search_schedule: str = "constant",
+        preset: Preset | None = None,
+        search_schedule: ScheduleName = "constant",
         search_share: float = 1.0,
-        search_unit: str = "step",
+        search_unit: SearchUnit = "step",
         schedule_kwargs: dict[str, Any] | None = None,
-        forward_model: str = "auto",
+        forward_model: Backend = "auto",
         model_kwargs: dict[str, Any] | None = None,
         value_expansion: int = 0,
         expanded_share: float = 0.5,
         branch_length: int = 0,
         action_noise_after_search: bool = False,
-        matmul_precision: str | None = None,
+        matmul_precision: MatmulPrecision | None = None,
         fast_update: bool = True,
     ) -> None:
         super().__init__(**sb3_arguments(locals()))

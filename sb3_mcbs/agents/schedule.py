@@ -2,6 +2,7 @@
 
 import functools
 from dataclasses import dataclass, replace
+from typing import get_args
 
 import numpy as np
 
@@ -10,9 +11,10 @@ from sb3_mcbs.search.checks import CheckedSettings
 from sb3_mcbs.search.random_streams import spawn_rng
 from sb3_mcbs.search.settings import MAX_DEPTH, MAX_ROLLOUTS, SearchSettings
 from sb3_mcbs.search.strategy_settings import BeamSettings, CEMSettings, TreeSettings
+from sb3_mcbs.types import ScheduleName, SearchUnit
 
-SCHEDULES = ("constant", "saturation", "anneal")
-UNITS = ("step", "episode")
+SCHEDULES: tuple[ScheduleName, ...] = get_args(ScheduleName)
+UNITS: tuple[SearchUnit, ...] = get_args(SearchUnit)
 #: Fraction of ``search_share`` while returns are saturated, without ``final_search_share``.
 _LEFT_WHEN_SATURATED = 0.2
 
@@ -47,9 +49,9 @@ class ScheduleSettings(CheckedSettings):
     group = "schedule_kwargs"
     flat = ("search_schedule", "search_share", "search_unit")
 
-    search_schedule: str = "constant"
+    search_schedule: ScheduleName = "constant"
     search_share: float = 1.0
-    search_unit: str = "step"
+    search_unit: SearchUnit = "step"
     final_search_share: float | None = None
     final_beam_width: int | None = None
     final_rollout_depth: int | None = None

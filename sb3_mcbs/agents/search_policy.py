@@ -1,7 +1,7 @@
 """Search around any trained agent."""
 
 import operator
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from copy import copy, deepcopy
 from types import MappingProxyType
 from typing import Any, ClassVar
@@ -26,6 +26,7 @@ from sb3_mcbs.agents.resumable import Searching
 from sb3_mcbs.search import SearchResult, SearchSettings, make_settings, with_preset
 from sb3_mcbs.search.settings import KEYWORDS, merged
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
+from sb3_mcbs.types import Backend, MatmulPrecision, Preset, Strategy
 
 #: Attributes with special handling when they are set.
 _HELD = ("model", "vec_env", "settings", "preset")
@@ -75,6 +76,18 @@ class SearchPolicy(RefusesOldNames, Searching):
         "planner": "its forward model is made from the environments; its memory is saved",
         "last_result": "of the last step; computed again before it is read",
     }
+    # The settings, which ``__getattr__`` reads.
+    beam_width: int
+    rollout_depth: int
+    n_simulations: int
+    beam_noise: float
+    strategy: Strategy
+    search_kwargs: Mapping[str, Any] | None
+    preset: Preset | None
+    forward_model: Backend
+    model_kwargs: Mapping[str, Any] | None
+    matmul_precision: MatmulPrecision | None
+    planner: Planner
 
     def __init__(
         self,
@@ -87,12 +100,12 @@ class SearchPolicy(RefusesOldNames, Searching):
         rollout_depth: int | None = None,
         n_simulations: int | None = None,
         beam_noise: float | None = None,
-        strategy: str | None = None,
+        strategy: Strategy | None = None,
         search_kwargs: dict[str, Any] | None = None,
-        preset: str | None = None,
-        forward_model: str | None = None,
+        preset: Preset | None = None,
+        forward_model: Backend | None = None,
         model_kwargs: dict[str, Any] | None = None,
-        matmul_precision: str | None = None,
+        matmul_precision: MatmulPrecision | None = None,
     ) -> None:
         arguments = locals()
         given = {name: arguments[name] for name in KEYWORDS if arguments[name] is not None}

@@ -10,8 +10,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from sb3_mcbs.agents.hyperparameters import SETTINGS
 from sb3_mcbs.agents.registry import SEARCHING
 from sb3_mcbs.experiments.document import Document, Place
+from sb3_mcbs.zoo import register
 from sb3_mcbs.zoo.manager import NAMES, SEARCHABLE, checked_search_evaluation
-from sb3_mcbs.zoo.registration import register
 
 #: Hyperparameters that are RL Zoo's own, and no parameters of an algorithm's constructor.
 _OF_RL_ZOO = (

@@ -13,8 +13,7 @@ from sb3_mcbs.experiments.machine import describe_machine
 from sb3_mcbs.experiments.manager import RunManager
 from sb3_mcbs.experiments.plan import Run
 from sb3_mcbs.experiments.results import FINISHED, RunFolder
-from sb3_mcbs.zoo import train
-from sb3_mcbs.zoo.registration import register
+from sb3_mcbs.zoo import register, train
 from sb3_mcbs.zoo.resume import resume
 
 

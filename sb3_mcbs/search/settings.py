@@ -6,10 +6,10 @@ import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, get_args
 
 from sb3_mcbs.search.checks import CheckedSettings, as_dict, known_keys
-from sb3_mcbs.types import BACKENDS
+from sb3_mcbs.types import BACKENDS, Backend, MatmulPrecision, Preset, Strategy
 
 #: Rollouts per decision and environment; more would exhaust the memory.
 MAX_ROLLOUTS = 100_000
@@ -19,7 +19,7 @@ MAX_STEPS = 10_000_000
 #: Larger noise clips every action to a corner, and may not fit float32.
 MAX_NOISE = 1e6
 MAX_THREADS = 1024
-MATMUL_PRECISIONS = ("highest", "high", "medium")
+MATMUL_PRECISIONS: tuple[MatmulPrecision, ...] = get_args(MatmulPrecision)
 #: The settings class of each strategy, see :mod:`~sb3_mcbs.search.strategy_settings`.
 STRATEGIES: dict[str, type["SearchSettings"]] = {}
 #: Settings of the machine, which presets leave alone.
@@ -65,7 +65,7 @@ class SearchSettings(CheckedSettings, ABC):
     :raises ValueError: if a value is out of range.
     """
 
-    strategy: ClassVar[str]
+    strategy: ClassVar[Strategy]
     group = "search_kwargs"
     flat = ("beam_width", "rollout_depth", "n_simulations", "beam_noise", "forward_model", "matmul_precision")
 
@@ -80,9 +80,9 @@ class SearchSettings(CheckedSettings, ABC):
     antithetic: bool = False
     noise_hold: int = 1
     proposal_dims: int | None = None
-    forward_model: str = "auto"
+    forward_model: Backend = "auto"
     n_threads: int = 0
-    matmul_precision: str | None = None
+    matmul_precision: MatmulPrecision | None = None
 
     def __init_subclass__(cls) -> None:
         STRATEGIES[cls.strategy] = cls
@@ -233,7 +233,7 @@ class SearchSettings(CheckedSettings, ABC):
         return {**super().grouped(), "strategy": self.strategy, "model_kwargs": threads}
 
     @staticmethod
-    def preset(name: str, **changes: Any) -> "SearchSettings":
+    def preset(name: Preset, **changes: Any) -> "SearchSettings":
         """The settings of a preset.
 
         :param name: one of :data:`PRESETS`.
@@ -250,7 +250,7 @@ KEYWORDS = (*SearchSettings.flat, "strategy", "search_kwargs", "model_kwargs")
 
 
 def make_settings(
-    strategy: str = "beam",
+    strategy: Strategy = "beam",
     search_kwargs: Mapping[str, Any] | None = None,
     model_kwargs: Mapping[str, Any] | None = None,
     **settings: Any,
@@ -297,7 +297,7 @@ def _warn_of_old_name() -> None:
 
 #: The settings of presets that differ from the defaults. In deterministic environments "efficient",
 #: "balanced" and "strong" simulate about 20, 110 and 580 steps per decision.
-PRESETS: dict[str, dict[str, Any]] = {
+PRESETS: dict[Preset, dict[str, Any]] = {
     "paper": {},
     "efficient": dict(n_simulations=1, search_kwargs=dict(rollout_noise=0.0, include_policy_action=True)),
     "balanced": dict(strategy="cem", beam_width=12, n_simulations=1, search_kwargs=dict(antithetic=True)),
@@ -311,7 +311,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 
 
-def with_preset(name: str | None, changes: Mapping[str, Any]) -> dict[str, Any]:
+def with_preset(name: Preset | None, changes: Mapping[str, Any]) -> dict[str, Any]:
     """Combine a preset with explicit settings.
 
     :param name: one of :data:`PRESETS`; ``None``: no preset.

@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-from rl_zoo3.utils import get_wrapper_class
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_mcbs.loading import load_statistics
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
+from sb3_mcbs.zoo import import_with_zoo
 
 #: What :func:`find_environment` reads, for the help of commands.
 ENV_HELP = "an id (HalfCheetah-v5), module:Id, or a function in a Python file (my_env.py:make)"
@@ -39,8 +39,9 @@ def find_environment(name: str, wrappers: Sequence[Any] = ()) -> Callable[..., g
     if os.getcwd() not in sys.path and "" not in sys.path:  # as with python -m
         sys.path.insert(0, os.getcwd())
     make = _function_in_file(name) if is_file(name) else _registered(name)
+    utils: Any = import_with_zoo("rl_zoo3.utils") if wrappers else None
     try:
-        wrap = get_wrapper_class({"env_wrapper": list(wrappers)}) if wrappers else None
+        wrap = utils.get_wrapper_class({"env_wrapper": list(wrappers)}) if wrappers else None
     except (ImportError, AttributeError, ValueError) as error:
         raise NoEnvironmentError(
             f"The wrappers {', '.join(map(str, wrappers))} cannot be imported: {error}. Write each as "

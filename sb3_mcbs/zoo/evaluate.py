@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_mcbs.agents import SearchPolicy
 from sb3_mcbs.agents.episodes import Episode, play
 from sb3_mcbs.search import PRESETS
+from sb3_mcbs.types import Preset
 from sb3_mcbs.zoo.arguments import add_agent, errors_in_words, whole_number
 from sb3_mcbs.zoo.evaluations import ACTOR, SEARCH
 from sb3_mcbs.zoo.subject import DEFAULT_PRESET, Subject, default_preset, find_subject
@@ -50,7 +51,7 @@ class Result(NamedTuple):
 
 
 def searching_policies(
-    agent: OffPolicyAlgorithm, env: VecEnv, presets: Sequence[str], seed: int
+    agent: OffPolicyAlgorithm, env: VecEnv, presets: Sequence[Preset], seed: int
 ) -> dict[str, SearchPolicy]:
     """
     :param agent: the agent
@@ -59,7 +60,7 @@ def searching_policies(
     :param seed: of the search
     :return: policies by their names in words
     """
-    wanted: Sequence[str | None] = presets or [default_preset(agent)]
+    wanted: Sequence[Preset | None] = presets or [default_preset(agent)]
     return {
         f"{SEARCH}, {preset}" if preset else SEARCH: SearchPolicy(agent, env, seed=seed, preset=preset)
         for preset in wanted
@@ -67,7 +68,7 @@ def searching_policies(
 
 
 def evaluate(
-    agent: OffPolicyAlgorithm, env: VecEnv, presets: Sequence[str], seeds: Sequence[int]
+    agent: OffPolicyAlgorithm, env: VecEnv, presets: Sequence[Preset], seeds: Sequence[int]
 ) -> Iterator[Result]:
     """
     Play the same episodes with the actor alone and with search.

@@ -1,7 +1,7 @@
 """
 Adds this package's algorithms and its ExperimentManager to RL Zoo.
 
-Called by the import hook for each module while RL Zoo is imported, or for all modules by :func:`register`.
+Called by the import hook for each module while RL Zoo is imported, or for all by :func:`register_all`.
 This module must not import RL Zoo at the top level: the hook calls it during RL Zoo's own import.
 """
 
@@ -24,15 +24,8 @@ NAMED = frozenset(
 )
 
 
-def register() -> None:
-    """
-    Add ``mcbs_td3`` and the other algorithms of this package to RL Zoo's commands.
-
-    An installed package does this by itself when ``rl_zoo3`` is imported. Call it if the import hook is
-    switched off. Calling it again changes nothing.
-
-    :raises ImportError: if RL Zoo is not installed
-    """
+def register_all() -> None:
+    """Import and patch all of RL Zoo's modules, see :func:`sb3_mcbs.zoo.register`."""
     for name in _PATCHES:
         after_import(importlib.import_module(name))
 

@@ -13,6 +13,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_mcbs.agents import MCBS
 from sb3_mcbs.agents.registry import ALGORITHMS
 from sb3_mcbs.loading import load_agent
+from sb3_mcbs.types import Preset
 from sb3_mcbs.zoo.environments import (
     drawn,
     find_environment,
@@ -24,7 +25,7 @@ from sb3_mcbs.zoo.paths import PathError
 from sb3_mcbs.zoo.repeat import load_run
 
 #: How an agent searches that was not trained with search.
-DEFAULT_PRESET = "efficient"
+DEFAULT_PRESET: Preset = "efficient"
 #: Vectorized wrappers of a run's configuration that a search cannot see through.
 _NOT_SEEN_THROUGH = ("vec_env_wrapper", "frame_stack")
 #: Where ``sb3-mcbs experiment`` has the folder of RL Zoo's run, below its own.
@@ -154,7 +155,7 @@ def _agent_of_run(folder: Path, env_id: str) -> Path:
     return found[0]
 
 
-def default_preset(agent: OffPolicyAlgorithm) -> str | None:
+def default_preset(agent: OffPolicyAlgorithm) -> Preset | None:
     """
     :param agent: the agent
     :return: how it searches where the command line does not say; None: with its own settings

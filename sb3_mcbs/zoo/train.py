@@ -1,13 +1,11 @@
 """``python -m sb3_mcbs.zoo.train``: the command line of ``rl_zoo3.train``, also without the import hook."""
 
-import importlib
-
-from sb3_mcbs.zoo.registration import register
+from sb3_mcbs.zoo import import_with_zoo, register
 
 
 def main() -> None:
     """Train as ``python -m rl_zoo3.train`` does, with this package registered."""
-    command = importlib.import_module("rl_zoo3.train")
+    command = import_with_zoo("rl_zoo3.train")
     register()
     command.train()
 

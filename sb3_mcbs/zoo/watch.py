@@ -6,13 +6,14 @@ from typing import Any
 
 from sb3_mcbs.agents import SearchPolicy
 from sb3_mcbs.search import PRESETS
+from sb3_mcbs.types import Preset
 from sb3_mcbs.video import Outcome, Performer, record_episodes
 from sb3_mcbs.zoo.arguments import add_agent, errors_in_words, positive, whole_number
 from sb3_mcbs.zoo.subject import DEFAULT_PRESET, Subject, default_preset, find_subject
 
 
 def record(
-    path: str | Path, subject: Subject, seed: int, preset: str | None, compare: bool, **how: Any
+    path: str | Path, subject: Subject, seed: int, preset: Preset | None, compare: bool, **how: Any
 ) -> list[Outcome]:
     """
     Record an episode of an agent that searches.

@@ -1,0 +1,27 @@
+# sb3-mcbs with RL Zoo's commands, for processors:
+#   docker build -t sb3-mcbs .
+#   docker run --rm -v "$PWD/logs:/work/logs" sb3-mcbs train --algo mcbs_td3 --env HalfCheetah-v5
+# For a GPU of NVIDIA: docker build --build-arg TORCH_INDEX=https://pypi.org/simple, and docker run --gpus all.
+ARG PYTHON=3.11
+FROM python:${PYTHON}-slim
+
+ARG TORCH_INDEX=https://download.pytorch.org/whl/cpu
+
+# Rendering without a screen.
+RUN apt-get update \
+    && apt-get install -y --no-install-recommends libosmesa6 libegl1 libgl1 \
+    && rm -rf /var/lib/apt/lists/*
+ENV MUJOCO_GL=osmesa PYOPENGL_PLATFORM=osmesa PIP_NO_CACHE_DIR=1
+
+# The large packages first, so that a change of the code does not install them again.
+COPY constraints.txt /tmp/
+RUN pip install --index-url ${TORCH_INDEX} "$(grep '^torch==' /tmp/constraints.txt)"
+
+COPY . /src
+RUN pip install -c /tmp/constraints.txt "/src[zoo,plots,report,video,hub,onnx]" && rm -rf /src
+
+RUN useradd --create-home user && mkdir /work && chown user /work
+USER user
+WORKDIR /work
+ENTRYPOINT ["sb3-mcbs"]
+CMD ["--help"]

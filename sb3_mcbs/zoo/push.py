@@ -1,0 +1,68 @@
+"""``sb3-mcbs push RUN|ZIP USER/NAME``: an agent to the Hugging Face hub, with both returns."""
+
+import argparse
+from pathlib import Path
+
+from sb3_mcbs.search import PRESETS
+from sb3_mcbs.sharing import push_to_hub
+from sb3_mcbs.sharing.hub import write_repository
+from sb3_mcbs.zoo.arguments import add_agent, errors_in_words, whole_number
+from sb3_mcbs.zoo.evaluate import evaluate, searching_policies
+from sb3_mcbs.zoo.subject import DEFAULT_PRESET, find_subject
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="sb3-mcbs push",
+        description="Evaluate an agent, its actor alone and with search, and upload it to the Hugging Face "
+        "hub with a model card. Log in first: hf auth login. No code from AGENT is run.",
+    )
+    add_agent(parser)
+    parser.add_argument("repo_id", metavar="USER/NAME", help="the repository; made if it is not there")
+    parser.add_argument(
+        "--preset",
+        choices=PRESETS,
+        metavar="PRESET",
+        help=f"how to search ({', '.join(PRESETS)}); by default as in training, or {DEFAULT_PRESET}",
+    )
+    parser.add_argument(
+        "--episodes", type=whole_number(1), metavar="N", default=10, help="to evaluate, by default 10"
+    )
+    parser.add_argument(
+        "--seed", type=whole_number(0), metavar="N", default=0, help="reset seed of the first"
+    )
+    parser.add_argument("--video", type=Path, metavar="FILE", help="from sb3-mcbs watch: .mp4 or .gif")
+    parser.add_argument("--private", action="store_true", help="make the repository private")
+    parser.add_argument(
+        "--folder", type=Path, metavar="FOLDER", help="write the files there, and upload nothing"
+    )
+    return parser
+
+
+def main() -> None:
+    """Read the command line, evaluate and upload."""
+    parser = _parser()
+    args = parser.parse_args()
+    presets = [args.preset] if args.preset else []
+    with errors_in_words(parser.prog):
+        subject = find_subject(args)
+        env = subject.make_env()
+        agent = subject.load(env)
+        returns = {}
+        for result in evaluate(agent, env, presets, range(args.seed, args.seed + args.episodes)):
+            returns[result.policy] = [episode.total for episode in result.episodes]
+            print(f"{result.policy}: {sum(returns[result.policy]) / args.episodes:.1f}", flush=True)
+        (policy,) = searching_policies(agent, env, presets, args.seed).values()
+        if args.folder is None:
+            about = (args.repo_id, subject.file, policy, subject.environment, returns)
+            print(push_to_hub(*about, video=args.video, private=args.private))
+            return
+        args.folder.mkdir(parents=True)
+        write_repository(
+            args.folder, args.repo_id, subject.file, policy, subject.environment, returns, args.video
+        )
+        print(f"wrote {args.folder}")
+
+
+if __name__ == "__main__":
+    main()
