@@ -3,7 +3,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.sb3-mcbs-installed
 
-.PHONY: help install train test test-slow docs lint format clean
+.PHONY: help install train test test-slow docs lint format check-gpu clean
 .PHONY: bench-search bench-training bench-scaling bench-memory bench-deadline bench-gradient_step bench-kill bench-soak
 
 help:
@@ -13,6 +13,7 @@ help:
 	@echo "make docs       the documentation as a site, in docs/_build/html"
 	@echo "make lint       ruff and mypy"
 	@echo "make format     ruff format, and what ruff check can repair"
+	@echo "make check-gpu  whether gradient steps on this machine's GPU are right, and how fast"
 	@echo "make bench-search and other measurements: see docs/speed.md and docs/checkpoints.md"
 
 $(BIN)/python:
@@ -49,6 +50,10 @@ format: $(STAMP)
 
 bench-search bench-scaling bench-memory bench-deadline bench-gradient_step bench-kill bench-soak: bench-%: $(STAMP)
 	$(BIN)/python -m benchmarks.$*
+
+# Another environment with the package and pytest does as well: python -m benchmarks.check_gpu
+check-gpu: $(STAMP)
+	$(BIN)/python -m benchmarks.check_gpu
 
 # SBX (JAX) is a peer to be measured against; it is kept apart.
 .venv-sbx/bin/python: benchmarks/requirements-sbx.txt

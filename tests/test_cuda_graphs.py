@@ -4,12 +4,10 @@ import logging
 import pickle
 from copy import copy, deepcopy
 
-import numpy as np
 import pytest
 import torch as th
 from sb3_contrib import TQC, CrossQ
 from stable_baselines3 import DDPG, SAC, TD3
-from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecNormalize
@@ -18,26 +16,8 @@ from sb3_mcbs import MCBSTD3
 from sb3_mcbs.networks import batches, graphs
 from sb3_mcbs.networks.batch_renorm import fuse_batch_renorm
 from sb3_mcbs.networks.batches import CopiedBatches, MirroredBatches
-from sb3_mcbs.networks.soft_update import CrossQSteps, SACSteps, TQCSteps
-from sb3_mcbs.networks.td3_update import FastUpdate
 from tests.fake_graph import FakeBackend
-
-
-class GraphTD3(FastUpdate):
-    fast_update = True
-
-
-class GraphDDPG(FastUpdate, DDPG):
-    fast_update = True
-
-
-class GraphCrossQ(CrossQSteps):
-    fast_update = True
-
-
-GRAPHED = {TD3: GraphTD3, DDPG: GraphDDPG, SAC: SACSteps, TQC: TQCSteps, CrossQ: GraphCrossQ}
-#: Smooth, for a ReLU whose input is 0 but for rounding is on in one of the two and off in the other.
-TANH = dict(net_arch=[16, 12], activation_fn=th.nn.Tanh)
+from tests.graph_helpers import GRAPHED, TANH, GraphTD3, SACSteps, agent_with_steps, assert_alike, train
 
 
 @pytest.fixture
@@ -45,31 +25,6 @@ def backend(monkeypatch) -> FakeBackend:
     fake = FakeBackend()
     monkeypatch.setitem(graphs.BACKENDS, "cpu", fake)
     return fake
-
-
-def agent_with_steps(cls, env=None, n_steps=60, **kwargs):
-    """An agent with steps in its replay buffer, whose networks are as they were made."""
-    env = make_vec_env("Pendulum-v1", 1, seed=0) if env is None else env()
-    settings = dict(policy_kwargs=TANH, buffer_size=200, batch_size=16, device="cpu", seed=0)
-    agent = cls("MlpPolicy", env, learning_starts=n_steps, **deepcopy(settings | kwargs))
-    agent.learn(n_steps)
-    agent.set_logger(configure(None, []))
-    return agent
-
-
-def train(agent, n_steps=40) -> None:
-    agent.set_random_seed(1)
-    for _ in range(n_steps // 2):
-        agent.train(gradient_steps=2, batch_size=16)
-
-
-def assert_alike(theirs, ours) -> None:
-    expected, found = theirs.policy.state_dict(), ours.policy.state_dict()
-    assert expected.keys() == found.keys()
-    for name, value in expected.items():
-        np.testing.assert_allclose(found[name], value, rtol=1e-3, atol=2e-5, err_msg=name)
-    if getattr(theirs, "log_ent_coef", None) is not None:
-        np.testing.assert_allclose(ours.log_ent_coef.detach(), theirs.log_ent_coef.detach(), rtol=1e-4)
 
 
 def normalized():
@@ -251,50 +206,6 @@ def test_every_replay_draws_new_noise(backend):
     assert backend.n_replays >= 12 and len(found) == 20
 
 
-@pytest.mark.parametrize("n_envs", [1, 2])
-def test_mirrored_batches_are_what_the_buffer_samples(n_envs):
-    env = make_vec_env("Pendulum-v1", n_envs)
-    buffer = ReplayBuffer(10 * n_envs, env.observation_space, env.action_space, n_envs=n_envs, device="cpu")
-    rng, added = np.random.default_rng(0), 0
-
-    def add(n):
-        for _ in range(n):
-            obs, next_obs = rng.normal(size=(2, n_envs, 3))
-            ends = rng.random(n_envs) < 0.5
-            infos = [{"TimeLimit.truncated": bool(rng.random() < 0.5)} for _ in range(n_envs)]
-            buffer.add(obs, next_obs, rng.normal(size=(n_envs, 1)), rng.normal(size=n_envs), ends, infos)
-
-    mirrored = MirroredBatches(buffer, 64, th.device("cpu"))
-    for n in (3, 1, 0, 5, 1, 4, 10, 10, 25, -1, 2, 7):
-        if n < 0:
-            buffer.reset()
-            n = 3
-        add(n)
-        added += n
-        buffer.dones[buffer.pos - 1] = 1  # as where a step is left out
-        mirrored.copy_rows(added)
-        np.random.seed(n)
-        expected = buffer.sample(64)
-        np.random.seed(n)
-        mirrored.draw(None)
-        for name, value in expected._asdict().items():
-            found = getattr(mirrored.read(), name)
-            assert (found is None) == (value is None), name
-            if value is not None:
-                np.testing.assert_array_equal(found, value.float(), err_msg=name)
-
-
-def test_a_row_is_copied_once(monkeypatch):
-    env = make_vec_env("Pendulum-v1", 1)
-    buffer = ReplayBuffer(100, env.observation_space, env.action_space, device="cpu")
-    mirrored, copied = MirroredBatches(buffer, 4, th.device("cpu")), []
-    monkeypatch.setattr(mirrored, "_copy", lambda first, end: copied.append((first, end)))
-    for n in range(1, 4):
-        buffer.add(np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 1)), np.zeros(1), np.zeros(1), [{}])
-        mirrored.copy_rows(n)
-    assert copied == [(0, 1), (1, 2), (2, 3)]
-
-
 def test_without_room_for_the_rows_batches_are_copied(backend, monkeypatch, caplog):
     def no_room(*args):
         raise th.OutOfMemoryError("CUDA out of memory")
@@ -408,7 +319,9 @@ def test_copies_capture_their_own(backend):
 def test_an_agent_that_searches_learns_the_same(settings, backend, make_agent, tmp_path):
     found = []
     for graphed in (False, True):
-        agent = make_agent("InvertedPendulum-v5", seed=1, policy_kwargs=deepcopy(TANH), cuda_graphs=graphed, **settings)
+        agent = make_agent(
+            "InvertedPendulum-v5", seed=1, policy_kwargs=deepcopy(TANH), cuda_graphs=graphed, **settings
+        )
         agent.set_logger(configure(str(tmp_path / str(graphed)), ["csv"]))
         agent.learn(80, log_interval=1)
         found.append(agent)

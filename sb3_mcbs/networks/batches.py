@@ -116,7 +116,7 @@ class CopiedBatches:
     @property
     def key(self) -> tuple[Any, ...]:
         """What a captured step contains of the batches."""
-        return self._target.data_ptr(), *self._widths
+        return self._target.data_ptr(), self._batch_size, *self._widths
 
 
 class MirroredBatches:
@@ -205,7 +205,7 @@ class MirroredBatches:
     @property
     def key(self) -> tuple[Any, ...]:
         """What a captured step contains of the batches."""
-        return self._rows.data_ptr(), self._drawn.data_ptr()
+        return self._rows.data_ptr(), *self._rows.shape, self._drawn.data_ptr(), self._batch_size
 
 
 Batches = CopiedBatches | MirroredBatches

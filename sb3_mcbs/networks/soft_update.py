@@ -31,6 +31,9 @@ from sb3_mcbs.networks.plain_networks import (
 )
 from sb3_mcbs.networks.update import Losses, Update
 
+#: Of a gradient step of CrossQ: whether the actor is updated in it; and of the critics' layers, and of the
+#: actor's if it is updated, whether their warm-up is over.
+_Kind = tuple[bool, tuple[bool, ...], tuple[bool, ...]]
 _LOG_SQRT_TWO_PI = math.log(math.sqrt(2 * math.pi))
 #: What the ``train`` methods call besides networks and optimizers; a user may replace it.
 _CALLED = [
@@ -226,11 +229,10 @@ class CrossQUpdate(SoftUpdate):
         self._critic_layers = _renormalizations(agent.critic)
         self._actor_layers = _renormalizations(agent.actor)
 
-    def next_kind(self, number: int) -> tuple[bool, tuple[bool, ...], tuple[bool, ...]]:
+    def next_kind(self, number: int) -> _Kind:
         """Count the gradient step.
 
-        :return: whether the actor is updated in it; and of the critics' layers, and the actor's if it is
-            updated, whether their warm-up is over.
+        :return: what Python decides in it.
         """
         agent = self._agent
         agent._n_updates += 1
@@ -241,13 +243,15 @@ class CrossQUpdate(SoftUpdate):
             tuple(map(self._count, self._actor_layers)) if with_actor else (),
         )
 
+    def losses_in(self, kind: _Kind) -> tuple[str, ...]:
+        """See :meth:`Update.losses_in`."""
+        return self.losses if kind[0] else ("ent_coef", "critic_loss")
+
     def _count(self, layer: FusedBatchRenorm1d) -> bool:
         steps: Any = layer.steps
         return self._counts.count(steps) > layer.warmup_steps
 
-    def step(
-        self, data: ReplayBufferSamples, kind: tuple[bool, tuple[bool, ...], tuple[bool, ...]]
-    ) -> Losses:
+    def step(self, data: ReplayBufferSamples, kind: _Kind) -> Losses:
         """Update the critics, and with ``kind[0]`` the entropy coefficient and the actor."""
         agent = self._agent
         with_actor, critic_past, actor_past = kind

@@ -62,6 +62,10 @@ class TD3Update(Update):
         self._agent._n_updates += 1
         return bool(self._agent._n_updates % self._agent.policy_delay == 0)
 
+    def losses_in(self, kind: bool) -> tuple[str, ...]:
+        """See :meth:`Update.losses_in`."""
+        return self.losses if kind else ("critic_loss",)
+
     def step(self, data: ReplayBufferSamples, kind: bool) -> Losses:
         """Update the critics, and with ``kind`` the actor and the targets."""
         # The training mode makes no difference to these layers, so it is not set.

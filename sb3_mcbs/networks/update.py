@@ -52,6 +52,10 @@ class Update:
         :return: what is logged, scalars by name.
         """
 
+    def losses_in(self, kind: Any) -> tuple[str, ...]:
+        """The names of the losses in a step of this kind."""
+        return self.losses
+
     @abstractmethod
     def constants(self) -> tuple[Any, ...]:
         """All that a captured step contains besides the optimizers: settings, and addresses."""
@@ -107,6 +111,7 @@ class Update:
             for number in range(gradient_steps):
                 kind = self.next_kind(number)
                 batches.draw(agent._vec_normalize_env)
+                memory.reset_losses(self.losses_in(kind))
 
                 def step(kind: Hashable = kind) -> Any:
                     for name, loss in self.step(batches.read(), kind).items():
@@ -163,8 +168,10 @@ class GraphMemory:
         self.counts = HostCounts()
         self._batches: Batches | None = None
         self._rates: list[th.Tensor] = []
+        self._rate_values: list[float] = []
         self._losses: th.Tensor | None = None
-        self._logged: tuple[str, ...] = ()
+        self._names: tuple[str, ...] = ()
+        self._from_before: set[str] = set()
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), ()
@@ -196,24 +203,37 @@ class GraphMemory:
         return self._rates
 
     def begin_losses(self, names: tuple[str, ...], device: th.device) -> th.Tensor:
-        """Forget the losses of the previous ``train``.
+        """Note that ``train`` was called.
 
-        :param names: of the losses.
-        :return: ``[names, 2]``, zeros at the same address: to be filled with sums and numbers.
+        :param names: of all losses.
+        :return: ``[names, 2]``, at the same address: sums and numbers of the losses.
         """
         if self._losses is None:
             self._losses = th.zeros((len(names), 2), device=device)
-        self._losses.zero_()
-        self._logged = names
+        self._names, self._from_before = names, {*names}
         return self._losses
 
+    def reset_losses(self, names: tuple[str, ...]) -> None:
+        """Forget the losses of previous calls of ``train``, if this one has others of these names.
+
+        :param names: of the losses of the next step.
+        """
+        assert self._losses is not None
+        stale = self._from_before.intersection(names)
+        self._from_before -= stale
+        if len(stale) == len(self._names):
+            self._losses.zero_()
+        else:
+            for name in stale:
+                self._losses[self._names.index(name)].zero_()
+
     def record_losses(self, logger: Logger) -> None:
-        """Record the mean losses of the last ``train``, once.
+        """Record the mean losses of the last ``train`` that had them, once.
 
         :param logger: of the agent.
         """
-        if self._losses is not None and self._logged:
-            for name, (total, number) in zip(self._logged, self._losses.tolist(), strict=True):
+        if self._losses is not None:
+            for name, (total, number) in zip(self._names, self._losses.tolist(), strict=True):
                 if number:
                     logger.record(f"train/{name}", total / number)
-        self._logged = ()
+            self._losses.zero_()
