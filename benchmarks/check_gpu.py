@@ -1,7 +1,7 @@
 """Whether gradient steps in CUDA graphs are right and fast on this machine's GPU: ``make check-gpu``.
 
-Runs ``tests/test_gpu.py``, then measures gradient steps and whole trainings on HalfCheetah-v5. Takes less than
-six minutes. It needs this package with its tests, and pytest.
+Runs ``tests/test_gpu.py``, then measures gradient steps and whole trainings on HalfCheetah-v5. Takes less
+than six minutes. It needs this package with its tests, and pytest.
 """
 
 import argparse
@@ -82,7 +82,7 @@ def make_agent(cls: type[OffPolicyAlgorithm], device: str, **kwargs: Any) -> Off
     own = dict(settings(1))
     if cls in AGENTS["CrossQ"]:
         del own["policy_kwargs"]  # CrossQ's default networks are part of the method
-    agent = cls("MlpPolicy", make_vec_env(ENV, 1, seed=0), device=device, **own, **kwargs)  # type: ignore[arg-type]
+    agent = cls("MlpPolicy", make_vec_env(ENV, 1, seed=0), device=device, **own, **kwargs)
     agent.learn(own["learning_starts"] + 100)
     return agent
 

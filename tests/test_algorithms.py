@@ -20,7 +20,8 @@ OF_PRESETS = {"beam_width", "rollout_depth", "n_simulations", "beam_noise", "str
 
 def keywords(cls) -> list[str]:
     """The parameters that are not SB3's."""
-    return [*SETTINGS, *(["fast_update"] if issubclass(cls, FastUpdate | MCBSCrossQ) else [])]
+    fast = ["fast_update"] if issubclass(cls, FastUpdate | MCBSCrossQ) else []
+    return [*SETTINGS, *fast, "cuda_graphs"]
 
 
 @pytest.mark.parametrize("cls", SEARCHING)
