@@ -4,6 +4,7 @@ import logging
 import pickle
 from copy import copy, deepcopy
 
+import numpy as np
 import pytest
 import torch as th
 from sb3_contrib import TQC, CrossQ
@@ -330,3 +331,34 @@ def test_an_agent_that_searches_learns_the_same(settings, backend, make_agent, t
     assert "train/critic_loss" in columns[0]
     assert set(columns[0].split(",")) == set(columns[1].split(","))
     assert copy(found[1])._graph_memory is not found[1]._graph_memory
+
+
+@pytest.mark.parametrize("cls", [TD3, DDPG])
+def test_replayed_actions_are_sb3s(cls, backend):
+    theirs, ours = (agent_with_steps(each) for each in (cls, GRAPHED[cls]))
+    backend.n_replays, rng = 0, np.random.default_rng(0)
+
+    def assert_same_actions(agents=(theirs, ours)):
+        for shape in ((1, 3), (4, 3), (3,), (1, 3)):
+            observations = rng.normal(size=shape)
+            (expected, _), (found, _) = (agent.predict(observations) for agent in agents)
+            assert found.shape == expected.shape and found.dtype == expected.dtype
+            np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+
+    for _ in range(4):
+        assert_same_actions()
+    for agent in (theirs, ours):
+        train(agent, 4)
+    assert_same_actions()
+    for agent in (theirs, ours):
+        agent.set_parameters({"policy": {k: v / 2 for k, v in agent.policy.state_dict().items()}}, False)
+    assert_same_actions()
+    assert backend.n_replays >= 12 and backend.n_captures == 2, "one for each number of rows"
+    for agent in (theirs, ours):
+        agent.policy.actor.mu[1] = th.nn.ReLU()
+    assert_same_actions()
+    replays = backend.n_replays
+    for agent in (theirs, ours):
+        agent.policy.actor.mu[1].register_forward_hook(lambda module, inputs, output: output * 0)
+    assert_same_actions()
+    assert backend.n_replays == replays

@@ -113,3 +113,12 @@ def test_a_resumed_run_says_that_it_is_not_exact(tmp_path):
     with pytest.warns(UserWarning, match="not exact: on cuda"):
         learn(agent, tmp_path, 120)
     assert agent.num_timesteps == 120 and agent._graph_memory.graphs.n_captured == 2
+
+
+def test_actions_are_those_of_sb3():
+    theirs, ours = pair(TD3)
+    for number in range(8):
+        observations = np.random.default_rng(number).normal(size=(1, 3))
+        (expected, _), (found, _) = (agent.predict(observations) for agent in (theirs, ours))
+        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
+    assert ours._graph_memory.acting.graphs.n_captured == 1

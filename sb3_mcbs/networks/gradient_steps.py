@@ -3,7 +3,7 @@
 import logging
 from abc import abstractmethod
 from collections.abc import Callable, Collection
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, ClassVar
 
 import torch as th
@@ -90,7 +90,7 @@ class GradientSteps(OffPolicyAlgorithm):
             except TypeError as reason:
                 self._say_once(f"Gradient steps are not captured in CUDA graphs: {reason}.")
             else:
-                with th.cuda.device(self.device) if self.device.type == "cuda" else nullcontext():
+                with self._current_device():
                     update.train_in_graphs(gradient_steps, batch_size, self._graph_memory)
                 return
         if self.device.type != "cpu":  # captured steps may have left them there
@@ -100,6 +100,10 @@ class GradientSteps(OffPolicyAlgorithm):
             super().train(gradient_steps, batch_size)
         else:
             update.train(gradient_steps, batch_size)
+
+    def _current_device(self) -> AbstractContextManager[Any]:
+        """Make the agent's GPU the one on which graphs are captured."""
+        return th.cuda.device(self.device) if self.device.type == "cuda" else nullcontext()
 
     def _adams(self) -> list[th.optim.Optimizer]:
         own: Any = self

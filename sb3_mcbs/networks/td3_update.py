@@ -9,6 +9,7 @@ to float32 rounding.
 import functools
 from typing import Any
 
+import numpy as np
 import torch as th
 from stable_baselines3 import TD3
 from stable_baselines3.common.preprocessing import get_action_dim
@@ -172,6 +173,29 @@ class FastUpdate(GradientSteps, TD3):
     def _make_update(self) -> TD3Update:
         check_unreplaced(_CALLED)
         return TD3Update(self)
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """
+        Get the actor's action, on a GPU by a CUDA graph if there is one observation for each environment.
+
+        :param observation: the input observation
+        :param state: not used
+        :param episode_start: not used
+        :param deterministic: not used: the actor is deterministic
+        :return: the action and ``state``
+        """
+        if self._in_graphs and self.fast_update:
+            with self._current_device():
+                actions = self._graph_memory.acting.actions(self.policy, observation)
+            if actions is not None:
+                return actions, state
+        return super().predict(observation, state, episode_start, deterministic)
 
 
 def _pairs(observations: th.Tensor, actions: th.Tensor) -> th.Tensor:

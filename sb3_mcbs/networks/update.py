@@ -10,6 +10,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_mcbs.networks import adam
+from sb3_mcbs.networks.acting import Acting
 from sb3_mcbs.networks.batches import Batches, MirroredBatches, batches_of
 from sb3_mcbs.networks.graphs import Graphs
 
@@ -166,6 +167,7 @@ class GraphMemory:
     def __init__(self) -> None:
         self.graphs = Graphs()
         self.counts = HostCounts()
+        self.acting = Acting()
         self._batches: Batches | None = None
         self._rates: list[th.Tensor] = []
         self._rate_values: list[float] = []
