@@ -12,6 +12,8 @@ import numpy as np
 import torch as th
 from stable_baselines3 import TD3
 
+from sb3_mcbs.agents.registry import ALGORITHMS
+
 
 def save_agent(make_agent, folder: Path, cls: type = TD3, **settings):
     """Make an agent and save it.
@@ -22,6 +24,13 @@ def save_agent(make_agent, folder: Path, cls: type = TD3, **settings):
     path = folder / f"{cls.__name__}.zip"
     agent.save(path)
     return agent, path
+
+
+def untrained_agent(repo: str, filename: str) -> str:
+    """Write the file of an untrained agent in place of one from the hub."""
+    algo, _, env_id = repo.removeprefix("sb3/").partition("-")
+    ALGORITHMS[algo]("MlpPolicy", env_id.replace("-v3", "-v4"), buffer_size=10, device="cpu").save(filename)
+    return filename
 
 
 def assert_same_agent(loaded, other, n=64):

@@ -78,6 +78,7 @@ RUNS = {
     "MCBSTD3, pool": maker(MCBSTD3, forward_model="pool"),
     "MCBSTD3, MuJoCo": maker(MCBSTD3, "InvertedPendulum-v5"),
     "MCBSTD3, value expansion": maker(MCBSTD3, "InvertedPendulum-v5", n_envs=2, value_expansion=2),
+    "MCBSTD3, branches": maker(MCBSTD3, "InvertedPendulum-v5", n_envs=2, value_expansion=2, branch_length=6),
     "MCBSTD3, saturation by episodes": maker(
         MCBSTD3,
         "InvertedPendulum-v5",
@@ -98,6 +99,13 @@ RUNS = {
         "InvertedPendulum-v5",
         value_expansion=2,
         policy_kwargs=dict(net_arch=[16, 16], renorm_warmup_steps=30),
+    ),
+    "MCBSCrossQ, branches": maker(
+        MCBSCrossQ,
+        "InvertedPendulum-v5",
+        value_expansion=2,
+        branch_length=6,
+        policy_kwargs=dict(net_arch=[16, 16]),
     ),
     "TD3, Ornstein-Uhlenbeck, two environments": maker(TD3, n_envs=2, action_noise=OU_NOISE),
     "TD3, whole episodes": maker(TD3, "InvertedPendulum-v5", train_freq=(1, "episode"), gradient_steps=-1),

@@ -39,6 +39,7 @@ from sb3_mcbs.agents.registry import ALGORITHMS
 from sb3_mcbs.models import families
 from sb3_mcbs.search import PRESETS, BeamSettings, CEMSettings, SearchSettings, TreeSettings
 from sb3_mcbs.search.settings import KEYWORDS, STRATEGIES
+from tests.agent_files import untrained_agent
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -106,13 +107,6 @@ def pages_with(*languages: str) -> list:
 @pytest.fixture
 def nothing_stays_registered(own_adapters: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(families, "_FAMILIES", dict(families._FAMILIES))
-
-
-def untrained_agent(repo: str, filename: str) -> str:
-    """Write the file of an untrained agent in place of one from the hub."""
-    algo, _, env_id = repo.removeprefix("sb3/").partition("-")
-    ALGORITHMS[algo]("MlpPolicy", env_id.replace("-v3", "-v4"), buffer_size=10, device="cpu").save(filename)
-    return filename
 
 
 @pytest.mark.parametrize("path", pages_with("python"))

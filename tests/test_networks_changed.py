@@ -10,8 +10,7 @@ from torch import nn
 from torch.nn.utils import prune
 
 from sb3_mcbs import MCBSDDPG, MCBSSAC, MCBSTD3, MCBSTQC, SearchPolicy
-from sb3_mcbs.agents.value_expansion import target_actor
-from sb3_mcbs.networks.functions import STOCHASTIC
+from sb3_mcbs.networks.functions import STOCHASTIC, target_actor
 from tests.conftest import SEARCHING, WITHOUT_SEARCH, snapshot_vec_env
 
 

@@ -34,6 +34,7 @@ SETTINGS: dict[str, Any] = {
     "model_kwargs": None,
     "value_expansion": 0,
     "expanded_share": 0.5,
+    "branch_length": 0,
     "action_noise_after_search": False,
     "matmul_precision": None,
 }
@@ -258,6 +259,7 @@ class SearchAttributes(RefusesOldNames):
     model_kwargs: dict[str, Any] | None
     value_expansion: int
     expanded_share: float
+    branch_length: int
     action_noise_after_search: bool
     matmul_precision: str | None
     #: Contents of the dictionaries at the last check.

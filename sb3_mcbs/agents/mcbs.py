@@ -102,6 +102,7 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
         self._prediction: Prediction | None = None
         self._states = None
         self.rollout_rng = None
+        self.branches = None
         self.learned_model: LearnedModel | None = None
         self._noise_without_search: ActionNoise | None = None
 
@@ -460,4 +461,4 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
 
     def _excluded_save_params(self) -> list[str]:
         # learn() makes the noise again; exact checkpoints, taken during learn(), need it.
-        return [*super()._excluded_save_params(), *MCBS.not_checkpointed, "_noise_without_search"]
+        return [*super()._excluded_save_params(), *MCBS.not_checkpointed, "_noise_without_search", "branches"]

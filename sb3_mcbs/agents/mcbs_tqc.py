@@ -60,6 +60,8 @@ class MCBSTQC(MCBS, TQCSteps, TQC):
         of :class:`~sb3_mcbs.agents.EnsembleSettings`
     :param value_expansion: simulated steps before critic targets bootstrap (0: none, as in SB3)
     :param expanded_share: the share of every batch that is expanded
+    :param branch_length: expand simulated transitions of the current actor instead of stored ones: the
+        length of its rollouts from stored states (0: none)
     :param action_noise_after_search: add ``action_noise`` to searched actions too
     :param matmul_precision: precision of the networks' float32 products (None: the process's setting)
     :param cuda_graphs: on a GPU, capture the gradient steps of plain MLPs in CUDA graphs;
@@ -113,6 +115,7 @@ class MCBSTQC(MCBS, TQCSteps, TQC):
         model_kwargs: dict[str, Any] | None = None,
         value_expansion: int = 0,
         expanded_share: float = 0.5,
+        branch_length: int = 0,
         action_noise_after_search: bool = False,
         matmul_precision: str | None = None,
         cuda_graphs: bool = True,

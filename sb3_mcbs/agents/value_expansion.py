@@ -8,7 +8,7 @@ are exact, actions are not old ones as with ``n_steps``, and values propagate se
 
 import functools
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from operator import itemgetter
 from typing import Any, ClassVar, NamedTuple
@@ -20,11 +20,12 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples, RolloutReturn
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_mcbs.agents.branches import Branches, Samples
 from sb3_mcbs.agents.checked_rollouts import CheckedRollouts
 from sb3_mcbs.agents.planner import Planner
 from sb3_mcbs.agents.roots import Prediction
 from sb3_mcbs.models import ForwardModelError
-from sb3_mcbs.networks.functions import STOCHASTIC, policy_function, soft_policy_function
+from sb3_mcbs.networks.functions import STOCHASTIC, target_actor
 from sb3_mcbs.networks.torch_settings import one_thread
 from sb3_mcbs.search import SearchSettings
 from sb3_mcbs.search.checks import CheckedSettings
@@ -32,10 +33,9 @@ from sb3_mcbs.types import Observations, map_arrays, put_rows, take_rows
 
 logger = logging.getLogger("sb3_mcbs")
 
-Samples = ReplayBufferSamples | DictReplayBufferSamples
-
 #: A larger value is surely a mistake.
 MAX_EXPANSION = 1000
+MAX_BRANCH_LENGTH = 100_000
 
 
 @dataclass(frozen=True)
@@ -46,20 +46,33 @@ class ValueExpansionSettings(CheckedSettings):
         actor, before the target bootstraps from the critics. 0: none, as in SB3.
     :param expanded_share: the share of every batch whose transitions are expanded. Every gradient step
         simulates ``value_expansion`` environment steps for each of them.
+    :param branch_length: 0: stored transitions are expanded. Above: ``expanded_share`` of every batch are
+        simulated transitions instead, from rollouts of the current actor that branch off stored states and
+        are so many steps long. Every gradient step continues them by ``value_expansion`` steps, up to which
+        the transitions' targets reach. See :class:`~sb3_mcbs.agents.branches.Branches`.
     :raises TypeError: if a value has the wrong type.
     :raises ValueError: if a value is out of range.
     """
 
-    flat = ("value_expansion", "expanded_share")
+    flat = ("value_expansion", "expanded_share", "branch_length")
 
     value_expansion: int = 0
     expanded_share: float = 0.5
+    branch_length: int = 0
 
     def __post_init__(self) -> None:
         self._set_integer("value_expansion", 0, MAX_EXPANSION)
         self._set_number("expanded_share", 1.0)
+        self._set_integer("branch_length", 0, MAX_BRANCH_LENGTH)
         if self.value_expansion and not self.expanded_share:
             raise ValueError("value_expansion needs an expanded_share above 0: nothing would be expanded.")
+        if self.branch_length and not self.value_expansion:
+            raise ValueError("branch_length needs a value_expansion above 0: nothing would be simulated.")
+        if 0 < self.branch_length < self.value_expansion:
+            raise ValueError(
+                f"branch_length must be 0 or at least value_expansion ({self.value_expansion}): every "
+                f"gradient step continues the branches by so many steps; got {self.branch_length}."
+            )
 
     def check_search(self, settings: SearchSettings) -> None:
         """Refuse settings of the search that do not work with value expansion.
@@ -140,7 +153,7 @@ class ExpandedReplayBuffer(ReplayBuffer):
         super().add(obs, next_obs, action, reward, done, infos)
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> Any:
-        """Sample transitions, and expand ``expanded_share`` of them.
+        """Sample transitions, ``expanded_share`` of them expanded, or simulated where there are branches.
 
         :param batch_size: number of transitions.
         :param env: normalises observations and rewards.
@@ -148,13 +161,18 @@ class ExpandedReplayBuffer(ReplayBuffer):
         """
         agent = self.expanding_agent
         n_expanded = round(agent.expanded_share * batch_size)
+        branches: Branches | None = agent.go_on_with_branches(n_expanded, env) if n_expanded else None
+        if branches is not None and not len(branches):
+            n_expanded = 0  # no stored state to branch off
         samples = []
         if n_expanded < batch_size:
             own: Any = super().sample(batch_size - n_expanded, env=env)
             if own.discounts is None:
                 own = own._replace(discounts=th.full_like(own.rewards, agent.gamma))
             samples.append(own)
-        if n_expanded:
+        if n_expanded and branches is not None:
+            samples.append(branches.sample(n_expanded, self, agent.rollout_rng, env))
+        elif n_expanded:
             samples.append(self.sample_expanded(n_expanded, agent.rollout_rng, env))
         return type(samples[0])(*(_joined(fields) for fields in zip(*samples, strict=True)))
 
@@ -343,16 +361,6 @@ class _Path(NamedTuple):
     observations: Observations
 
 
-def target_actor(
-    agent: Any,
-) -> Callable[[Observations, np.random.Generator], tuple[np.ndarray, np.ndarray]]:
-    """The current actor of the targets: returns actions and their entropy bonus."""
-    if isinstance(agent, STOCHASTIC):
-        return soft_policy_function(agent)
-    policy = policy_function(agent, target=True)
-    return lambda observations, rng: (policy(observations), np.zeros(len(observations)))
-
-
 def _joined(fields: Sequence[Any]) -> Any:
     if isinstance(fields[0], dict):
         return {key: th.cat([field[key] for field in fields]) for key in fields[0]}
@@ -368,8 +376,11 @@ class Expanding(CheckedRollouts):
     """
 
     value_expansion: int
+    branch_length: int
     planner: Planner | None
     n_simulated_steps: int
+    #: Simulated rollouts that are not part of saved agents; exact checkpoints contain them.
+    branches: Branches | None = None
     rollout_rng: np.random.Generator | None = None
     _keeps_states = False
     #: The states in which the next actions are executed.
@@ -391,6 +402,22 @@ class Expanding(CheckedRollouts):
     def _check_buffer(self) -> None:
         if self.replay_buffer is not None:  # it may have been taken away
             ValueExpansionSettings.of(self).check_buffer(self.replay_buffer.optimize_memory_usage)
+
+    def go_on_with_branches(self, n: int, env: VecNormalize | None) -> Branches | None:
+        """Continue the simulated rollouts, which begin anew if a setting changed their shape.
+
+        :param n: how many.
+        :param env: normalises observations and rewards.
+        :return: ``None`` without a ``branch_length``.
+        """
+        if not self.branch_length:
+            return None
+        shape = n, self.value_expansion, self.branch_length
+        if self.branches is None or self.branches.shape != shape:
+            self.branches = Branches(self.replay_buffer, *shape)
+        assert self.rollout_rng is not None
+        self.branches.go_on(self.replay_buffer, self, self.rollout_rng, env)
+        return self.branches
 
     def _check_states(self) -> None:
         """Refuse a forward model whose states cannot be kept."""

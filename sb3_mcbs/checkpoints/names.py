@@ -18,6 +18,7 @@ from stable_baselines3.her.goal_selection_strategy import GoalSelectionStrategy
 from stable_baselines3.sac import policies as sac_policies
 from stable_baselines3.td3 import policies as td3_policies
 
+from sb3_mcbs.agents.branches import Branches
 from sb3_mcbs.agents.registry import ALGORITHMS
 from sb3_mcbs.checkpoints.encoding import name_of
 from sb3_mcbs.snapshot.functions import FunctionName
@@ -27,7 +28,7 @@ _CLASSES: tuple[type, ...] = (
     bool, int, float, str, bytes, list, tuple, dict, set, frozenset, deque, OrderedDict, defaultdict,
     random.Random, np.random.Generator, np.random.RandomState, np.random.PCG64, np.random.MT19937,
     np.random.PCG64DXSM, np.random.Philox, np.random.SFC64,
-    *ALGORITHMS.values(),
+    *ALGORITHMS.values(), Branches,
     buffers.ReplayBuffer, buffers.NStepReplayBuffer, buffers.DictReplayBuffer, HerReplayBuffer,
     GoalSelectionStrategy, type_aliases.TrainFreq, type_aliases.TrainFrequencyUnit,
     noise.NormalActionNoise, noise.OrnsteinUhlenbeckActionNoise, noise.VectorizedActionNoise,

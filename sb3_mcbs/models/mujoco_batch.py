@@ -159,6 +159,10 @@ class MujocoBatchModel(ForwardModel):
         states, kept = table[:, : self._state_size], table[:, self._state_size :]
         return np.ascontiguousarray(states), np.ascontiguousarray(kept)
 
+    def rows(self) -> np.ndarray:
+        """The present states of all rows ``[rows, *]``, each of which :meth:`set_roots` takes as a root."""
+        return np.concatenate([self.states, self._kept], axis=1)
+
     def select(self, index: np.ndarray) -> None:
         self.states, self._kept = self.states[index], self._kept[index]
         self._diverged, self._ended = self._diverged[index], self._ended[index]

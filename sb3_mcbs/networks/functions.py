@@ -178,6 +178,22 @@ def soft_policy_function(
     return draw
 
 
+def target_actor(
+    agent: Any,
+) -> Callable[[Observations, np.random.Generator], tuple[np.ndarray, np.ndarray]]:
+    """The current actor of the targets.
+
+    :param agent: a supported agent.
+    :return: observations ``[rows, *obs_shape]``, generator of noise -> float32 actions ``[rows, act_dim]``
+        in [-1, 1], and their entropy bonus ``[rows]``, see :func:`soft_policy_function`. TD3 and DDPG need no
+        noise and have no bonus.
+    """
+    if isinstance(agent, STOCHASTIC):
+        return soft_policy_function(agent)
+    policy = policy_function(agent, target=True)
+    return lambda observations, rng: (policy(observations), np.zeros(len(observations)))
+
+
 def unscales_as_sb3(agent: Any) -> bool:
     """Whether actions are scaled by SB3's own formula, in float32.
 
