@@ -4,7 +4,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.sb3-mcbs-installed
 EXTRAS := dev,docs,zoo,plots,box2d,tuning,ray,report,video,hub,onnx
 
-.PHONY: help install train test test-slow docs lint format clean support-table
+.PHONY: help install train test test-slow docs lint format check-gpu clean support-table
 .PHONY: bench-search bench-training bench-scaling bench-memory bench-deadline bench-gradient_step bench-kill bench-soak
 
 help:
@@ -15,6 +15,7 @@ help:
 	@echo "make lint       ruff and mypy"
 	@echo "make format     ruff format, and what ruff check can repair"
 	@echo "make support-table  docs/environments.md: which environments work, measured here"
+	@echo "make check-gpu  whether gradient steps on this machine's GPU are right, and how fast"
 	@echo "make bench-search and other measurements: see docs/speed.md and docs/checkpoints.md"
 
 $(BIN)/python:
@@ -51,6 +52,10 @@ format: $(STAMP)
 
 bench-search bench-scaling bench-memory bench-deadline bench-gradient_step bench-kill bench-soak: bench-%: $(STAMP)
 	$(BIN)/python -m benchmarks.$*
+
+# Another environment with the package and pytest does as well: python -m benchmarks.check_gpu
+check-gpu: $(STAMP)
+	$(BIN)/python -m benchmarks.check_gpu
 
 # SBX (JAX) is a peer to be measured against; it is kept apart.
 .venv-sbx/bin/python: benchmarks/requirements-sbx.txt

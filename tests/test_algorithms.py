@@ -22,7 +22,8 @@ OF_PRESETS = {"beam_width", "rollout_depth", "n_simulations", "beam_noise", "str
 
 def keywords(cls) -> list[str]:
     """The parameters that are not SB3's."""
-    return [*SETTINGS, *(["fast_update"] if issubclass(cls, FastUpdate | MCBSCrossQ) else [])]
+    fast = ["fast_update"] if issubclass(cls, FastUpdate | MCBSCrossQ) else []
+    return [*SETTINGS, *fast, "cuda_graphs"]
 
 
 def test_type_checkers_know_all_names():

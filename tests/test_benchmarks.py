@@ -188,3 +188,39 @@ def test_the_support_table_names_what_is_missing_and_what_fails(monkeypatch, tmp
     with pytest.raises(SystemExit, match="has no lines"):
         run(monkeypatch, support_table, "--page", str(page), "--only", "No-v0")
     assert page.read_text() == "no marks"
+
+
+def test_the_check_of_a_gpu_needs_one(monkeypatch):
+    from benchmarks import check_gpu
+
+    monkeypatch.setattr(check_gpu.th.cuda, "is_available", lambda: False)
+    with pytest.raises(SystemExit, match="There is no GPU that torch can use"):
+        run(monkeypatch, check_gpu)
+
+
+@pytest.mark.slow
+def test_the_check_of_a_gpu_measures(monkeypatch):
+    from benchmarks import check_gpu
+
+    row = check_gpu.gradient_step("TD3", 0.0, "cpu")
+    assert row["SB3 / graphs"] == pytest.approx(row["SB3 us"] / row["graphs us"])
+    for name in check_gpu.TRAININGS:
+        row = check_gpu.training(name, 0.5, "cpu")
+        assert row["steps"] > 0 and row["steps/s"] > 0
+
+
+def test_the_check_of_a_gpu_reports_failures(monkeypatch, tmp_path, capsys):
+    from benchmarks import check_gpu
+
+    (tmp_path / "test_it.py").write_text("def test_good(): pass\ndef test_bad(): assert 0\n")
+    monkeypatch.setattr(check_gpu, "TESTS", tmp_path / "test_it.py")
+    monkeypatch.setattr(check_gpu.th.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(check_gpu.th.cuda, "get_device_name", lambda: "Some GPU")
+    monkeypatch.setattr(check_gpu, "gradient_step", lambda *args: {"gradient step": args[0]})
+    monkeypatch.setattr(check_gpu, "training", lambda *args: {"training": args[0], "steps/s": 2.0})
+    with pytest.raises(SystemExit, match="Not passed: test_bad"):
+        run(monkeypatch, check_gpu)
+    results = common.read("check_gpu")
+    assert results["checks"] == {"test_good": "passed", "test_bad": "failed"}
+    assert [row["of SB3's"] for row in results["trainings"]] == [1.0] * 5
+    assert "| test_bad | failed |" in capsys.readouterr().out

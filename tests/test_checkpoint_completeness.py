@@ -13,7 +13,7 @@ from sb3_mcbs import MCBS, MCBSTD3, ExactCheckpointCallback, SearchPolicy, resum
 from sb3_mcbs.checkpoints import CheckpointError
 from sb3_mcbs.checkpoints.components import NOT_STATE, components, not_state_of
 from sb3_mcbs.checkpoints.state import RUN, RunState
-from sb3_mcbs.networks.td3_update import FastUpdate
+from sb3_mcbs.networks.gradient_steps import GradientSteps
 from tests.checkpoint_helpers import crash, learn
 from tests.test_checkpoints import make_env, maker
 
@@ -122,7 +122,7 @@ def test_every_attribute_is_captured_or_left_out_for_a_reason(tmp_path):
             for cls, reasons in all_reasons.items():
                 if isinstance(part, cls):
                     left_out |= {(cls, attribute) for attribute in set(vars(part)) & set(reasons)}
-    assert {MCBS, FastUpdate, SearchPolicy, ExactCheckpointCallback} < all_reasons.keys()
+    assert {MCBS, GradientSteps, SearchPolicy, ExactCheckpointCallback} < all_reasons.keys()
     assert all(reason for reasons in all_reasons.values() for reason in reasons.values())
     only_at_times = {"_stopped_run", "_checked_env", "pbar", "store", "_settings", "_vec_env"}
     expected = {

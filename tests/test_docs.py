@@ -282,7 +282,11 @@ def field_defaults(*classes: type) -> dict[str, object]:
 
 def test_the_page_of_settings_has_all_with_their_defaults() -> None:
     search, training = table_of("The search"), table_of("While training")
-    assert defaults_of(search) | defaults_of(training) == {**SETTINGS, "fast_update": True}
+    assert defaults_of(search) | defaults_of(training) == {
+        **SETTINGS,
+        "fast_update": True,
+        "cuda_graphs": True,
+    }
     assert set(search) == {*KEYWORDS, "preset"}
     assert known_by(search, "`SearchPolicy`") == set(search)
     assert defaults_of(table_of("search_kwargs")) == field_defaults(BeamSettings, TreeSettings, CEMSettings)

@@ -227,6 +227,7 @@ def test_valid_settings_search_in_environments(pendulums, env_id: str, kwargs: d
 OWN = {
     "action_noise_after_search": st.booleans(),
     "fast_update": st.booleans(),
+    "cuda_graphs": st.booleans(),
     "preset": st.sampled_from([None, "paper", "efficient", "balanced"]),
     "action_noise": st.sampled_from([None, NormalActionNoise(np.zeros(1), np.ones(1))]),
 }

@@ -97,7 +97,7 @@ def sb3_arguments(arguments: Mapping[str, Any]) -> dict[str, Any]:
 
     :param arguments: of the constructor, ``locals()``.
     """
-    ours = {*SETTINGS, "fast_update", "self", "__class__"}
+    ours = {*SETTINGS, "fast_update", "cuda_graphs", "self", "__class__"}
     passed_on = {name: value for name, value in arguments.items() if name not in ours}
     return {**passed_on, "_init_setup_model": False}
 

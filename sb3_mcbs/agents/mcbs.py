@@ -211,7 +211,7 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
         # As with SB3's agents, networks and environments are shared with the original. Settings are not.
         made = type(self).__new__(type(self))
         vars(made).update(vars(self))
-        for name in {"_schedule", "planner", *GROUPS} & vars(self).keys():
+        for name in {"_schedule", "planner", "_graph_memory", *GROUPS} & vars(self).keys():
             vars(made)[name] = copy(vars(self)[name])
         if made.planner is not None:
             made.planner.agent = made

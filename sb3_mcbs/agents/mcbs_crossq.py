@@ -11,11 +11,11 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_mcbs.agents.hyperparameters import sb3_arguments
 from sb3_mcbs.agents.mcbs import MCBS
-from sb3_mcbs.networks.batch_renorm import fuse_batch_renorm
+from sb3_mcbs.networks.soft_update import CrossQSteps
 from sb3_mcbs.types import Backend, MatmulPrecision, Preset, ScheduleName, SearchUnit, Strategy
 
 
-class MCBSCrossQ(MCBS, CrossQ):
+class MCBSCrossQ(MCBS, CrossQSteps, CrossQ):
     """
     Monte Carlo Beam Search for CrossQ (MCBS-CrossQ).
 
@@ -65,6 +65,8 @@ class MCBSCrossQ(MCBS, CrossQ):
     :param action_noise_after_search: add ``action_noise`` to searched actions too
     :param matmul_precision: precision of the networks' float32 products (None: the process's setting)
     :param fast_update: compute batch renormalisation with SB3-Contrib's mathematics but fewer instructions
+    :param cuda_graphs: on a GPU, capture the gradient steps of plain MLPs in CUDA graphs;
+        other networks use SB3's own steps
     """
 
     def __init__(
@@ -116,22 +118,12 @@ class MCBSCrossQ(MCBS, CrossQ):
         action_noise_after_search: bool = False,
         matmul_precision: MatmulPrecision | None = None,
         fast_update: bool = True,
+        cuda_graphs: bool = True,
     ) -> None:
         super().__init__(**sb3_arguments(locals()))
         self._init_search(locals())
         self.fast_update = fast_update
+        self.cuda_graphs = cuda_graphs
 
         if _init_setup_model:
             self._setup_model()
-
-    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        """
-        Update the networks as CrossQ does.
-
-        :param gradient_steps: how many gradient steps to do
-        :param batch_size: transitions sampled for each
-        """
-        if not isinstance(self.fast_update, bool):
-            raise TypeError(f"fast_update must be True or False, got {self.fast_update!r}.")
-        fuse_batch_renorm(self.policy, self.fast_update)
-        super().train(gradient_steps, batch_size)

@@ -63,6 +63,8 @@ class MCBSDDPG(MCBS, FastUpdate, DDPG):
     :param matmul_precision: precision of the networks' float32 products (None: the process's setting)
     :param fast_update: compute gradient steps of plain MLPs with SB3's mathematics but fewer instructions;
         other networks use SB3's own
+    :param cuda_graphs: on a GPU, capture the gradient steps of plain MLPs in CUDA graphs;
+        other networks use SB3's own steps
     """
 
     def __init__(
@@ -108,10 +110,12 @@ class MCBSDDPG(MCBS, FastUpdate, DDPG):
         action_noise_after_search: bool = False,
         matmul_precision: MatmulPrecision | None = None,
         fast_update: bool = True,
+        cuda_graphs: bool = True,
     ) -> None:
         super().__init__(**sb3_arguments(locals()))
         self._init_search(locals())
         self.fast_update = fast_update
+        self.cuda_graphs = cuda_graphs
 
         if _init_setup_model:
             self._setup_model()

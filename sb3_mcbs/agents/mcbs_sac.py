@@ -11,10 +11,11 @@ from stable_baselines3.sac.policies import SACPolicy
 
 from sb3_mcbs.agents.hyperparameters import sb3_arguments
 from sb3_mcbs.agents.mcbs import MCBS
+from sb3_mcbs.networks.soft_update import SACSteps
 from sb3_mcbs.types import Backend, MatmulPrecision, Preset, ScheduleName, SearchUnit, Strategy
 
 
-class MCBSSAC(MCBS, SAC):
+class MCBSSAC(MCBS, SACSteps, SAC):
     """
     Monte Carlo Beam Search for SAC (MCBS-SAC).
 
@@ -62,6 +63,8 @@ class MCBSSAC(MCBS, SAC):
         length of its rollouts from stored states (0: none)
     :param action_noise_after_search: add ``action_noise`` to searched actions too
     :param matmul_precision: precision of the networks' float32 products (None: the process's setting)
+    :param cuda_graphs: on a GPU, capture the gradient steps of plain MLPs in CUDA graphs;
+        other networks use SB3's own steps
     """
 
     def __init__(
@@ -113,9 +116,11 @@ class MCBSSAC(MCBS, SAC):
         branch_length: int = 0,
         action_noise_after_search: bool = False,
         matmul_precision: MatmulPrecision | None = None,
+        cuda_graphs: bool = True,
     ) -> None:
         super().__init__(**sb3_arguments(locals()))
         self._init_search(locals())
+        self.cuda_graphs = cuda_graphs
 
         if _init_setup_model:
             self._setup_model()

@@ -14,6 +14,9 @@ from torch import nn
 class FusedBatchRenorm1d(BatchRenorm1d):
     """``BatchRenorm1d`` whose training mode is one operation of autograd; equal up to float32 rounding."""
 
+    #: Whether the warm-up is over, where the layer cannot ask its own counter of steps (in a CUDA graph).
+    past_warmup: bool | None = None
+
     def forward(self, x: th.Tensor) -> th.Tensor:
         """
         Normalize the input tensor.
@@ -31,14 +34,17 @@ class _TrainingMode(th.autograd.Function):
     """Normalizes with the batch's statistics, after the warm-up corrected by the running ones."""
 
     @staticmethod
-    def forward(ctx: Any, x: th.Tensor, scale: th.Tensor, bias: th.Tensor, layer: BatchRenorm1d) -> th.Tensor:
+    def forward(
+        ctx: Any, x: th.Tensor, scale: th.Tensor, bias: th.Tensor, layer: FusedBatchRenorm1d
+    ) -> th.Tensor:
         mean = x.mean(dim=0)
         centred = x - mean
         variance = centred.square().sum(dim=0) / (len(x) - 1)
         # Output: scale * (centred + shift) / deviation + bias.
         shift = ratio = None
         corrected = variance
-        if layer.steps > layer.warmup_steps:  # type: ignore[operator]
+        known = layer.past_warmup
+        if layer.steps > layer.warmup_steps if known is None else known:  # type: ignore[operator]
             running = (layer.ra_var + layer.eps).sqrt_()  # type: ignore[operator, union-attr]
             ratio = (variance + layer.eps).sqrt_().div_(running).clamp_(1 / layer.rmax, layer.rmax)
             shift = ((mean - layer.ra_mean) / running).clamp_(-layer.dmax, layer.dmax)  # type: ignore[operator]

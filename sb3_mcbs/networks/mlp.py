@@ -65,6 +65,11 @@ class _Linear:
         return self.weight.device
 
     @property
+    def signature(self) -> tuple[Any, ...]:
+        bias = None if self.bias is None else self.bias.data_ptr()
+        return self.weight.data_ptr(), tuple(self.weight.shape), bias
+
+    @property
     def column(self) -> th.Tensor:
         """The bias as ``[out_features, 1]``."""
         if self._column is None:
@@ -83,13 +88,13 @@ class _Linear:
 
 
 class _Normalization:
-    """Batch renormalization in evaluation mode, with the present parameters and running statistics.
+    """Batch renormalization in evaluation mode, with the statistics of its first use.
 
     :param layer: the layer.
     :raises TypeError: if it has other parameters or statistics than SB3-Contrib gives it.
     """
 
-    __slots__ = ("_columns",)
+    __slots__ = ("_columns", "_layer", "_tensors")
 
     def __init__(self, layer: BatchRenorm1d) -> None:
         state = own_state(layer)
@@ -102,24 +107,39 @@ class _Normalization:
             _check_parameter(tensor)
         for tensor in (mean, variance):
             _check_parameter(tensor, th.Tensor)
-        with th.no_grad():
-            deviation = (variance + layer.eps).sqrt_()
-            self._columns = [each.unsqueeze(1) for each in (mean, deviation, scale, bias)]
+        self._layer, self._tensors = layer, (mean, variance, scale, bias)
+        self._columns: list[th.Tensor] = []
 
     @property
     def device(self) -> th.device:
-        return self._columns[0].device
+        return self._tensors[0].device
+
+    @property
+    def signature(self) -> tuple[Any, ...]:
+        layer = self._layer
+        constants = type(layer), layer.eps, layer.momentum, layer.rmax, layer.dmax, layer.warmup_steps
+        return *constants, *(tensor.data_ptr() for tensor in self._tensors), layer.steps.data_ptr()  # type: ignore[operator]
+
+    @property
+    def columns(self) -> list[th.Tensor]:
+        """Mean, standard deviation, scale and bias as ``[features, 1]``."""
+        if not self._columns:
+            mean, variance, scale, bias = self._tensors
+            with th.no_grad():
+                deviation = th.add(variance, self._layer.eps).sqrt_()
+                self._columns = [each.unsqueeze(1) for each in (mean, deviation, scale, bias)]
+        return self._columns
 
     def factors(self) -> list[th.Tensor]:
         """One factor and one summand per feature."""
         with th.no_grad():
-            mean, deviation, scale, bias = (column[:, 0] for column in self._columns)
+            mean, deviation, scale, bias = (column[:, 0] for column in self.columns)
             gain = scale / deviation
             return [gain, bias - mean * gain]
 
     def __call__(self, x: th.Tensor) -> th.Tensor:
         # The layer's own operations in its order: the result is equal to the bit.
-        mean, deviation, scale, bias = self._columns
+        mean, deviation, scale, bias = self.columns
         return (x - mean).div_(deviation).mul_(scale).add_(bias)
 
 
@@ -141,7 +161,7 @@ class MLP:
     """Linear layers with ReLU and Tanh between them, to be called without autograd.
 
     It keeps the layers and parameters that the modules have when it is made. Batch renormalization is that of
-    evaluation mode, with the statistics at that time.
+    evaluation mode, with the statistics of its first call.
 
     :param modules: ``nn.Sequential``s and single layers.
     :raises TypeError: if a layer is of another kind, or calling it would do more than compute its output.
@@ -182,6 +202,11 @@ class MLP:
         first = self._layers[0]
         assert isinstance(first, _Linear | _Normalization)
         return first.device
+
+    @property
+    def signature(self) -> tuple[Any, ...]:
+        """The layers' addresses and constants: MLPs of the same signature compute the same."""
+        return tuple(layer if isinstance(layer, type) else layer.signature for layer in self._layers)
 
     def table(self) -> np.ndarray:
         """The layers for compiled code, which are valid as long as this object lives.

@@ -163,14 +163,30 @@ def parameters_of(network: Any, mlps: list[MLP]) -> list[th.Tensor]:
     return [parameter for mlp in mlps for parameter in mlp.parameters]
 
 
-def check_trained(network: Any, parameters: list[th.Tensor]) -> None:
+def all_parameters(network: Any) -> list[th.Tensor]:
+    """The parameters of an actor that samples, or of a critic.
+
+    :param network: the actor or critic, of which :func:`actor_mlp` or :func:`critic_mlps` can be made.
+    :return: in the order of ``network.parameters()``.
+    :raises TypeError: if the network has parameters that it does not use.
+    """
+    state = vars(network)
+    _, *called = state["_modules"].values()  # the first extracts features
+    expected = state.get("q_networks")
+    if expected is None:
+        expected = [network.latent_pi, network.mu, network.log_std]
+    if state["_parameters"] or called != expected:
+        raise TypeError(f"a {type(network).__name__} has other modules than those that it calls")
+    return list(network.parameters())
+
+
+def check_trained(optimizer: Any, parameters: list[th.Tensor]) -> None:
     """Refuse to train a network that needs more than plain Adam steps on its gradients.
 
-    :param network: the actor or critic, with its optimizer.
+    :param optimizer: that of the actor or critic.
     :param parameters: its parameters.
     :raises TypeError: says why.
     """
-    optimizer: Any = network.optimizer
     if type(optimizer) is not th.optim.Adam or len(optimizer.param_groups) != 1:
         raise TypeError(
             f"the optimizer is {type(optimizer).__name__}, not Adam with a single group of parameters"

@@ -6,9 +6,8 @@ networks one tensor at a time. Random numbers are drawn in the same order, so bo
 to float32 rounding.
 """
 
-import logging
-from collections.abc import Collection
-from typing import ClassVar
+import functools
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -18,6 +17,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.td3 import td3 as td3_module
 from torch.nn import functional as F
 
+from sb3_mcbs.networks.gradient_steps import GradientSteps, checked_switch
 from sb3_mcbs.networks.plain_networks import (
     actor_mlp,
     check_trained,
@@ -25,32 +25,28 @@ from sb3_mcbs.networks.plain_networks import (
     critic_mlps,
     parameters_of,
 )
-
-logger = logging.getLogger("sb3_mcbs")
-
-_SB3S_TRAIN = TD3.train
+from sb3_mcbs.networks.update import Losses, Update
 
 
-class TD3Update:
+class TD3Update(Update):
     """The gradient steps of a TD3 agent whose networks are plain MLPs.
 
-    It keeps the networks, optimizers and parameters that the agent has when it is made.
-
-    :param agent: the agent; its networks, optimizers, replay buffer and settings are used, and changed, as
-        by its own ``train``.
+    :param agent: the agent; see :class:`Update`.
     :raises TypeError: if something about a network or optimizer is not covered; use SB3's ``train`` then.
     """
 
+    losses = ("actor_loss", "critic_loss")
+
     def __init__(self, agent: TD3) -> None:
-        self._agent = agent
+        super().__init__(agent, [agent.actor.optimizer, agent.critic.optimizer])
         self._actor, self._actor_target = actor_mlp(agent.actor), actor_mlp(agent.actor_target)
         self._critics, self._critic_targets = critic_mlps(agent.critic), critic_mlps(agent.critic_target)
         actor = parameters_of(agent.actor, [self._actor])
         actor_target = parameters_of(agent.actor_target, [self._actor_target])
         critic = parameters_of(agent.critic, self._critics)
         critic_target = parameters_of(agent.critic_target, self._critic_targets)
-        check_trained(agent.actor, actor)
-        check_trained(agent.critic, critic)
+        check_trained(agent.actor.optimizer, actor)
+        check_trained(agent.critic.optimizer, critic)
         if len({*map(id, actor), *map(id, critic)}) != len(actor) + len(critic):
             raise TypeError("a parameter is used twice")
         self._targets_and_networks = [(critic_target, critic), (actor_target, actor)]
@@ -59,31 +55,34 @@ class TD3Update:
         if th.is_anomaly_enabled():
             raise TypeError("autograd looks for anomalies")
 
-    def train(self, gradient_steps: int, batch_size: int) -> None:
-        """Do what ``TD3.train`` does.
+    def next_kind(self, number: int) -> bool:
+        """Count the gradient step.
 
-        :param gradient_steps: how many updates of the critics.
-        :param batch_size: transitions sampled for each.
+        :return: whether the actor and the targets are updated in it.
         """
-        agent = self._agent
-        # The training mode makes no difference to these layers, so it is not set.
-        agent._update_learning_rate([agent.actor.optimizer, agent.critic.optimizer])
-        actor_losses, critic_losses = [], []
-        with th.no_grad():
-            for _ in range(gradient_steps):
-                agent._n_updates += 1
-                assert agent.replay_buffer is not None
-                data = agent.replay_buffer.sample(batch_size, env=agent._vec_normalize_env)
-                pairs = _pairs(data.observations, data.actions)
-                critic_losses.append(self._update_critics(data, pairs))
-                if agent._n_updates % agent.policy_delay == 0:
-                    actor_losses.append(self._update_actor(pairs))
-                    self._update_target_networks()
+        self._agent._n_updates += 1
+        return bool(self._agent._n_updates % self._agent.policy_delay == 0)
 
-        agent.logger.record("train/n_updates", agent._n_updates, exclude="tensorboard")
-        if actor_losses:
-            agent.logger.record("train/actor_loss", np.mean(actor_losses))
-        agent.logger.record("train/critic_loss", np.mean(critic_losses))
+    def losses_in(self, kind: bool) -> tuple[str, ...]:
+        """See :meth:`Update.losses_in`."""
+        return self.losses if kind else ("critic_loss",)
+
+    def step(self, data: ReplayBufferSamples, kind: bool) -> Losses:
+        """Update the critics, and with ``kind`` the actor and the targets."""
+        # The training mode makes no difference to these layers, so it is not set.
+        pairs = _pairs(data.observations, data.actions)
+        losses = {"critic_loss": self._update_critics(data, pairs)}
+        if kind:
+            losses["actor_loss"] = self._update_actor(pairs)
+            self._update_target_networks()
+        return losses
+
+    def constants(self) -> tuple[Any, ...]:
+        """See :meth:`Update.constants`."""
+        agent = self._agent
+        mlps = [self._actor, self._actor_target, *self._critics, *self._critic_targets]
+        settings = agent.gamma, agent.tau, agent.target_policy_noise, agent.target_noise_clip
+        return *settings, *(mlp.signature for mlp in mlps)
 
     def _targets(self, data: ReplayBufferSamples) -> th.Tensor:
         """Clipped double-Q targets with target policy smoothing.
@@ -101,7 +100,7 @@ class TD3Update:
         discounts = agent.gamma if data.discounts is None else data.discounts.t()
         return data.rewards.t() + (1 - data.dones.t()) * discounts * next_values
 
-    def _update_critics(self, data: ReplayBufferSamples, pairs: th.Tensor) -> float:
+    def _update_critics(self, data: ReplayBufferSamples, pairs: th.Tensor) -> th.Tensor:
         """One step of all critics.
 
         :param pairs: ``[obs_dim + act_dim, batch]``.
@@ -114,10 +113,10 @@ class TD3Update:
             errors = outputs[-1] - targets
             losses.append(errors.square().mean())
             critic.backward(pairs, outputs, errors * (2 / errors.numel()), of_parameters=True)
-        _adam_step(self._agent.critic.optimizer)
-        return float(sum(losses))
+        self.adam_step(1)
+        return functools.reduce(th.add, losses)
 
-    def _update_actor(self, pairs: th.Tensor) -> float:
+    def _update_actor(self, pairs: th.Tensor) -> th.Tensor:
         """One step of the actor up the first critic.
 
         :param pairs: ``[obs_dim + act_dim, batch]``; its actions are overwritten.
@@ -129,8 +128,8 @@ class TD3Update:
         pairs[n_obs:] = actor_outputs[-1]
         values, gradient = self._action_gradient(pairs, n_obs)
         self._actor.backward(observations, actor_outputs, gradient, of_parameters=True)
-        _adam_step(self._agent.actor.optimizer)
-        return float(-values.mean())
+        self.adam_step(0)
+        return -values.mean()
 
     def _action_gradient(self, pairs: th.Tensor, n_obs: int) -> tuple[th.Tensor, th.Tensor]:
         """The gradient of the actor's loss with respect to its actions.
@@ -157,63 +156,46 @@ _CALLED = [
 ]
 
 
-class FastUpdate(TD3):
+class FastUpdate(GradientSteps, TD3):
     """
     TD3, or a subclass of it, whose gradient steps are those of :class:`TD3Update` where they can be.
 
     A subclass's constructor sets :attr:`fast_update` before the networks are set up.
     """
 
-    #: What neither ``save`` nor an exact checkpoint contains, and why.
-    not_checkpointed: ClassVar[Collection[str]] = {"_reasons_said": "messages to the user of this process"}
     #: ``False`` leaves gradient steps to SB3.
     fast_update: bool
-    #: The messages that said why gradient steps were left to SB3.
-    _reasons_said: frozenset[str] = frozenset()
+    _sb3s_train = TD3.train
 
-    def _setup_model(self) -> None:
-        super()._setup_model()
-        self._reasons_said = frozenset()
-        self._present_update()  # tells the user at once if the fast steps cannot be used
+    def _wants_update(self) -> bool:
+        return checked_switch(self, "fast_update")
 
     def _make_update(self) -> TD3Update:
         check_unreplaced(_CALLED)
-        if getattr(super().train, "__func__", None) is not _SB3S_TRAIN:
-            raise TypeError("a class of the agent overrides train")
         return TD3Update(self)
 
-    def _present_update(self) -> TD3Update | None:
-        """The fast gradient steps for the present networks and optimizers, or None if they cannot be used."""
-        if not isinstance(self.fast_update, bool):
-            raise TypeError(f"fast_update must be True or False, got {self.fast_update!r}.")
-        if not self.fast_update:
-            return None
-        try:
-            return self._make_update()
-        except TypeError as reason:
-            message = f"Gradient steps are SB3's own, not the fast ones: {reason}."
-            if message not in self._reasons_said:
-                self._reasons_said |= {message}
-                logger.info(message)
-                if self.verbose >= 1:
-                    print(message)
-            return None
-
-    def train(self, gradient_steps: int, batch_size: int = 100) -> None:
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """
-        Update the networks as SB3 does.
+        Get the actor's action, on a GPU by a CUDA graph if there is one observation for each environment.
 
-        :param gradient_steps: how many gradient steps to do
-        :param batch_size: transitions sampled for each
+        :param observation: the input observation
+        :param state: not used
+        :param episode_start: not used
+        :param deterministic: not used: the actor is deterministic
+        :return: the action and ``state``
         """
-        update = self._present_update()
-        if update is None:
-            super().train(gradient_steps, batch_size)
-        else:
-            update.train(gradient_steps, batch_size)
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), *FastUpdate.not_checkpointed]
+        if self._in_graphs and self.fast_update:
+            with self._current_device():
+                actions = self._graph_memory.acting.actions(self.policy, observation)
+            if actions is not None:
+                return actions, state
+        return super().predict(observation, state, episode_start, deterministic)
 
 
 def _pairs(observations: th.Tensor, actions: th.Tensor) -> th.Tensor:
@@ -224,17 +206,3 @@ def _pairs(observations: th.Tensor, actions: th.Tensor) -> th.Tensor:
     pairs[:n_obs] = observations.t()
     pairs[n_obs:] = actions.t()
     return pairs
-
-
-def _adam_step(optimizer: th.optim.Optimizer) -> None:
-    """Step Adam, on the CPU with all tensors in one call unless the user chose otherwise."""
-    group = optimizer.param_groups[0]
-    fuse = group["params"][0].device.type == "cpu" and not group["foreach"] and group["fused"] is None
-    if not fuse:  # on other devices torch groups the tensors itself
-        optimizer.step()
-        return
-    group["fused"] = True
-    try:
-        optimizer.step()
-    finally:
-        group["fused"] = None  # the settings are saved with the agent
