@@ -8,7 +8,7 @@ EXTRAS := dev,docs,zoo,plots,box2d,tuning,ray,report,video,hub,onnx
 .PHONY: bench-search bench-training bench-scaling bench-memory bench-deadline bench-gradient_step bench-kill bench-soak
 
 help:
-	@echo "make train      set up $(VENV), train MCBS-TD3 on HalfCheetah-v5 for 20 000 steps, report"
+	@echo "make train      set up $(VENV), train MCBS-CrossQ on HalfCheetah-v5 for 12 000 steps, report"
 	@echo "make test       set up $(VENV), run the tests on all cores (PYTEST_ARGS='-n 0': on one)"
 	@echo "make test-slow  the tests that build packages or take long"
 	@echo "make docs       the documentation as a site, in docs/_build/html"
@@ -29,8 +29,8 @@ $(STAMP): $(BIN)/python pyproject.toml setup.cfg constraints.txt _sb3_mcbs_build
 install: $(STAMP)
 
 train: $(STAMP)
-	$(BIN)/python -m rl_zoo3.train --algo mcbs_td3 --env HalfCheetah-v5 -n 20000 --eval-freq 5000 -P
-	$(BIN)/sb3-mcbs report --algo mcbs_td3 --env HalfCheetah-v5
+	$(BIN)/python -m rl_zoo3.train --algo mcbs_crossq --env HalfCheetah-v5 -n 12000 --eval-freq 3000 --seed 0 -P
+	$(BIN)/sb3-mcbs report --algo mcbs_crossq --env HalfCheetah-v5
 
 test: $(STAMP)
 	$(BIN)/python -m pytest -n auto $(PYTEST_ARGS)

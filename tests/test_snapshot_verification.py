@@ -12,6 +12,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from gymnasium.wrappers import FrameStackObservation, NormalizeObservation, TimeLimit, TransformReward
+from stable_baselines3.common.monitor import Monitor
 
 from sb3_mcbs.snapshot import (
     SnapshotAdapter,
@@ -67,6 +68,17 @@ def follow(env, n=6):
 
 
 # --- what passes -----------------------------------------------------------------------------------------
+
+
+def test_a_wrapper_below_a_monitor():
+    """SB3 puts a ``Monitor`` around the environment that it is given, and the agent another wrapper around that."""
+    env = SnapshotEnvWrapper(Monitor(SnapshotEnvWrapper(TimeLimit(Walk(), 50))))
+    assert env.verify()
+    layers = [env, env.env, env.env.env, env.env.env.env]
+    assert [type(layer) for layer in layers] == [SnapshotEnvWrapper, Monitor, SnapshotEnvWrapper, TimeLimit]
+    env.reset(seed=0)
+    copy = env.clone()
+    assert follow(copy) == follow(env)
 
 
 class Noisy(Walk):

@@ -114,7 +114,7 @@ class SnapshotEnvWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstr
     def __setattr__(self, name: str, value: Any) -> None:
         # ``VecEnv.set_attr`` means the outermost layer. Without this wrapper, that is the one below.
         own = vars(self).get("_own_attributes")
-        if own is None or name in own or type(self) is not SnapshotEnvWrapper:
+        if own is None or name in own or name == "__class__" or type(self) is not SnapshotEnvWrapper:
             super().__setattr__(name, value)
         else:
             setattr(self.env, name, value)
