@@ -71,7 +71,7 @@ def follow(env, n=6):
 
 
 def test_a_wrapper_below_a_monitor():
-    """SB3 puts a ``Monitor`` around the environment that it is given, and the agent another wrapper around that."""
+    """SB3 puts a ``Monitor`` around an environment, and the agent then wraps it again."""
     env = SnapshotEnvWrapper(Monitor(SnapshotEnvWrapper(TimeLimit(Walk(), 50))))
     assert env.verify()
     layers = [env, env.env, env.env.env, env.env.env.env]
