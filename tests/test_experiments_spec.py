@@ -122,7 +122,7 @@ SHIPPED = {
     "ablation": 18,
     "ablation-frozen": 66,
     "search-training": 55,
-    "crossq": 25,
+    "crossq": 35,
     "saturation": 20,
     "learned-model": 6,
 }

@@ -1,6 +1,7 @@
 """Training through RL Zoo's command: hyperparameters found, both policies evaluated, nothing disturbed."""
 
 import inspect
+import typing
 from pathlib import Path
 from typing import Any
 
@@ -231,7 +232,14 @@ def test_a_misspelt_value_is_one_line(
 
 def test_every_setting_that_is_a_name_is_known() -> None:
     parameters = inspect.signature(MCBSTD3).parameters
-    assert set(NAMES) == {name for name in SETTINGS if parameters[name].annotation in (str, str | None)}
+    found = {}
+    for name in SETTINGS:
+        kinds = [parameters[name].annotation, *typing.get_args(parameters[name].annotation)]
+        assert str not in kinds, f"{name} is any text"
+        for kind in kinds:
+            if typing.get_origin(kind) is typing.Literal:
+                found[name] = set(typing.get_args(kind))
+    assert {name: set(values) for name, values in NAMES.items()} == found
 
 
 def test_no_file_of_this_package_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -39,6 +39,7 @@ class GradientSteps(OffPolicyAlgorithm):
         super()._setup_model()
         self._reasons_said = frozenset()
         self._graph_memory = GraphMemory()
+        checked_switch(self, "cuda_graphs")
         self._present_update()  # tells the user at once if the fast steps cannot be used
 
     @property
