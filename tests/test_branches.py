@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_mcbs import MCBSTD3, MCBSCrossQ
+from sb3_mcbs import MCBSSAC, MCBSTD3, MCBSCrossQ
 from sb3_mcbs.agents.branches import Branches, n_rollouts
 from sb3_mcbs.networks.functions import STOCHASTIC, target_actor
 from tests.conftest import SEARCHING, snapshot_vec_env
@@ -171,3 +171,22 @@ def test_a_changed_setting_begins_anew(make_agent, tmp_path):
 def test_what_does_not_go_together_is_refused(make_agent, settings, words):
     with pytest.raises(ValueError, match=words):
         make_agent("InvertedPendulum-v5", **settings)
+
+
+@pytest.mark.parametrize("cls", [MCBSTD3, MCBSSAC])
+def test_a_step_that_diverges_is_left_out(make_agent, cls, monkeypatch):
+    agent, _ = trained(make_agent, "HalfCheetah-v5", n_envs=1, cls=cls, search_share=0.0)
+    model = agent.planner.model
+    step = model.step
+
+    def diverging(actions):
+        found = step(actions)
+        found.observations[0], found.rewards[0], found.valid[0] = np.nan, np.inf, False
+        return found
+
+    monkeypatch.setattr(model, "step", diverging)
+    branches = Branches(agent.replay_buffer, 4, 2, 50)
+    for _ in range(3):
+        branches.go_on(agent.replay_buffer, agent, np.random.default_rng(0), None)
+    assert branches.n_added == 3 * 3 * 2 and branches.left[0] == 0
+    assert all(np.isfinite(column).all() for column in branches.transitions)

@@ -158,7 +158,9 @@ class Branches:
             rewards = buffer._normalize_reward(step.rewards, env)
             steps.append(_Step(before, actions, after, rewards, bonus, step.terminated, goes_on & step.valid))
             goes_on = goes_on & step.goes_on
+            lost, seen_before = np.flatnonzero(~step.valid), seen
             before, seen = after, view.observe(step.observations)
+            put_rows(seen, lost, seen_before, lost)  # where a step diverged, the actor may not get what it gave
         self.states[going] = model.rows()
         put_rows(self.observations, going, after, slice(None))
         self.left[going] = np.where(goes_on, self.left[going] - n_steps, 0)
