@@ -155,9 +155,17 @@ def test_a_changed_setting_begins_anew(make_agent, tmp_path):
     assert agent.branches is not before and agent.branches.shape[2] == 12
     agent.branch_length = 0
     agent.learn(10, reset_num_timesteps=False)
+    assert agent.branches is None, "switched on again, they would be those of an old actor"
     agent.save(tmp_path / "agent")
     loaded = MCBSTD3.load(tmp_path / "agent", env=agent.get_env())
     assert loaded.branches is None and loaded.branch_length == 0
+
+
+def test_batches_of_another_size_do_not_begin_anew(make_agent):
+    agent, _ = trained(make_agent, "HalfCheetah-v5", n_envs=1, branch_length=9, search_share=0.0)
+    before, n_added = agent.branches, agent.branches.n_added
+    assert len(agent.replay_buffer.sample(6).actions) == 6
+    assert agent.branches is before and before.n_added > n_added
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,7 @@
 """Simulated transitions of the current actor, from which the critics and the actor learn.
 
 Rollouts branch off stored states and follow the current actor for some steps, as in MBPO (Janner et al.,
-2019), with the simulator as the model: every transition is exact, and none is older than
+2019), with the simulator as the model: every transition is exact, and hardly any is older than
 :data:`KEPT_UPDATES` gradient steps.
 """
 
@@ -21,7 +21,7 @@ Samples = ReplayBufferSamples | DictReplayBufferSamples
 
 #: How often a transition is learned from, on average. Fewer uses cost simulated steps and brought nothing.
 USES = 2
-#: Gradient steps whose transitions are kept.
+#: Gradient steps whose transitions are kept; more where rollouts ended early.
 KEPT_UPDATES = 400
 
 
@@ -102,6 +102,14 @@ class Branches:
     def __len__(self) -> int:
         return min(self.n_added, len(self.transitions[1]))
 
+    def fits(self, buffer: Any, shape: tuple[int, int, int]) -> bool:
+        """Whether these are branches of this shape, with states as the replay buffer's.
+
+        :param buffer: the replay buffer.
+        :param shape: see :attr:`shape`.
+        """
+        return self.shape == shape and self.states.shape[1] == buffer.expansion_states.shape[2]
+
     def go_on(self, buffer: Any, agent: Any, rng: np.random.Generator, env: VecNormalize | None) -> None:
         """Continue the rollouts.
 
@@ -160,7 +168,7 @@ class Branches:
             goes_on = goes_on & step.goes_on
             lost, seen_before = np.flatnonzero(~step.valid), seen
             before, seen = after, view.observe(step.observations)
-            put_rows(seen, lost, seen_before, lost)  # where a step diverged, the actor may not get what it gave
+            put_rows(seen, lost, seen_before, lost)  # the actor gets nothing that is not finite
         self.states[going] = model.rows()
         put_rows(self.observations, going, after, slice(None))
         self.left[going] = np.where(goes_on, self.left[going] - n_steps, 0)

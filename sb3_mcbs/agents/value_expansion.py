@@ -148,9 +148,10 @@ class ExpandedReplayBuffer(ReplayBuffer):
         :param done: ``[n_envs]``, whether the episode ended: the state is then of the next one.
         """
         states, self.states_after = self.states_after, None
-        self.expansion_held[self.pos] = False if states is None else ~np.asarray(done, dtype=bool)
         if states is not None:
+            make_room(self, states.shape[1])
             self.expansion_states[self.pos] = states
+        self.expansion_held[self.pos] = False if states is None else ~np.asarray(done, dtype=bool)
         super().add(obs, next_obs, action, reward, done, infos)
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> Any:
@@ -162,7 +163,7 @@ class ExpandedReplayBuffer(ReplayBuffer):
         """
         agent = self.expanding_agent
         n_expanded = round(agent.expanded_share * batch_size)
-        branches: Branches | None = agent.go_on_with_branches(n_expanded, env) if n_expanded else None
+        branches: Branches | None = agent.go_on_with_branches(env) if n_expanded else None
         if branches is not None and not len(branches):
             n_expanded = 0  # no stored state to branch off
         samples = []
@@ -297,13 +298,25 @@ def expand(buffer: ReplayBuffer, agent: Any) -> None:
     :raises ForwardModelError: if the forward model's states are not arrays.
     """
     if not isinstance(buffer, ExpandedReplayBuffer):
-        shape = (buffer.buffer_size, buffer.n_envs, batched_states(agent).shape[1])
-        held: Any = buffer
-        if getattr(held, "expansion_states", np.zeros(0)).shape != shape:
-            held.expansion_states = np.zeros(shape)
-            held.expansion_held = np.zeros(shape[:2], dtype=bool)
-        held.__class__ = _expanded_class(type(buffer))
+        make_room(buffer, batched_states(agent).shape[1])
+        buffer.__class__ = _expanded_class(type(buffer))
     vars(buffer)["expanding_agent"] = agent
+
+
+def make_room(buffer: ReplayBuffer, state_size: int) -> None:
+    """Give a replay buffer room for states. It loses those of a simulator with other states.
+
+    :param buffer: the replay buffer.
+    :param state_size: of the present simulator.
+    """
+    held: Any = buffer
+    shape = (buffer.buffer_size, buffer.n_envs, state_size)
+    known = getattr(held, "expansion_states", None)
+    if known is None or known.shape != shape:
+        if known is not None:
+            logger.info("The replay buffer's states are dropped: they are those of another simulator.")
+        held.expansion_states = np.zeros(shape)
+        held.expansion_held = np.zeros(shape[:2], dtype=bool)
 
 
 @functools.cache
@@ -394,6 +407,7 @@ class Expanding(CheckedRollouts):
     """
 
     value_expansion: int
+    expanded_share: float
     branch_length: int
     planner: Planner | None
     n_simulated_steps: int
@@ -421,26 +435,29 @@ class Expanding(CheckedRollouts):
         if self.replay_buffer is not None:  # it may have been taken away
             ValueExpansionSettings.of(self).check_buffer(self.replay_buffer.optimize_memory_usage)
 
-    def go_on_with_branches(self, n: int, env: VecNormalize | None) -> Branches | None:
-        """Continue the simulated rollouts, which begin anew if a setting changed their shape.
+    def go_on_with_branches(self, env: VecNormalize | None) -> Branches | None:
+        """Continue the simulated rollouts, which begin anew if settings or states are others.
 
-        :param n: how many transitions are sampled from them.
         :param env: normalises observations and rewards.
         :return: ``None`` without a ``branch_length``.
         """
         if not self.branch_length:
+            self.branches = None  # later they would be those of an old actor
             return None
-        shape = n_rollouts(n, self.value_expansion), self.value_expansion, self.branch_length
-        if self.branches is None or self.branches.shape != shape:
+        n_sampled = round(self.expanded_share * self.batch_size)
+        shape = n_rollouts(n_sampled, self.value_expansion), self.value_expansion, self.branch_length
+        if self.branches is None or not self.branches.fits(self.replay_buffer, shape):
             self.branches = Branches(self.replay_buffer, *shape)
         assert self.rollout_rng is not None
         self.branches.go_on(self.replay_buffer, self, self.rollout_rng, env)
         return self.branches
 
     def _check_states(self) -> None:
-        """Refuse a forward model whose states cannot be kept."""
+        """Refuse a forward model whose states cannot be kept, and drop states that it cannot go on from."""
         if self.value_expansion:
-            batched_states(self)
+            state_size = batched_states(self).shape[1]
+            if isinstance(self.replay_buffer, ExpandedReplayBuffer):
+                make_room(self.replay_buffer, state_size)
 
     def _expand_buffer(self) -> None:
         """Convert the replay buffer, before every use, since loading one replaces it."""
