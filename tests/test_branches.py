@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_mcbs import MCBSTD3, MCBSCrossQ
+from sb3_mcbs import MCBSSAC, MCBSTD3, MCBSCrossQ
 from sb3_mcbs.agents.branches import Branches, n_rollouts
 from sb3_mcbs.networks.functions import STOCHASTIC, target_actor
 from tests.conftest import SEARCHING, snapshot_vec_env
@@ -155,9 +155,17 @@ def test_a_changed_setting_begins_anew(make_agent, tmp_path):
     assert agent.branches is not before and agent.branches.shape[2] == 12
     agent.branch_length = 0
     agent.learn(10, reset_num_timesteps=False)
+    assert agent.branches is None, "switched on again, they would be those of an old actor"
     agent.save(tmp_path / "agent")
     loaded = MCBSTD3.load(tmp_path / "agent", env=agent.get_env())
     assert loaded.branches is None and loaded.branch_length == 0
+
+
+def test_batches_of_another_size_do_not_begin_anew(make_agent):
+    agent, _ = trained(make_agent, "HalfCheetah-v5", n_envs=1, branch_length=9, search_share=0.0)
+    before, n_added = agent.branches, agent.branches.n_added
+    assert len(agent.replay_buffer.sample(6).actions) == 6
+    assert agent.branches is before and before.n_added > n_added
 
 
 @pytest.mark.parametrize(
@@ -171,3 +179,22 @@ def test_a_changed_setting_begins_anew(make_agent, tmp_path):
 def test_what_does_not_go_together_is_refused(make_agent, settings, words):
     with pytest.raises(ValueError, match=words):
         make_agent("InvertedPendulum-v5", **settings)
+
+
+@pytest.mark.parametrize("cls", [MCBSTD3, MCBSSAC])
+def test_a_step_that_diverges_is_left_out(make_agent, cls, monkeypatch):
+    agent, _ = trained(make_agent, "HalfCheetah-v5", n_envs=1, cls=cls, search_share=0.0)
+    model = agent.planner.model
+    step = model.step
+
+    def diverging(actions):
+        found = step(actions)
+        found.observations[0], found.rewards[0], found.valid[0] = np.nan, np.inf, False
+        return found
+
+    monkeypatch.setattr(model, "step", diverging)
+    branches = Branches(agent.replay_buffer, 4, 2, 50)
+    for _ in range(3):
+        branches.go_on(agent.replay_buffer, agent, np.random.default_rng(0), None)
+    assert branches.n_added == 3 * 3 * 2 and branches.left[0] == 0
+    assert all(np.isfinite(column).all() for column in branches.transitions)

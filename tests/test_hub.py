@@ -165,3 +165,23 @@ def test_the_command_evaluates_and_uploads(
     cli.main()
     assert "wrote" in capsys.readouterr().out and (tmp_path / "out/README.md").is_file()
     assert len(hub.calls) == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--folder", "made"], "made is there already"),
+        (["--video", "none.mp4"], "no video none.mp4"),
+        (["--video", "mine.zip"], "shows .mp4 and .gif"),
+    ],
+)
+def test_what_cannot_be_written_is_refused_before_the_evaluation(
+    words: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    saved(TD3, tmp_path, make_env())
+    (tmp_path / "made").mkdir()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["sb3-mcbs", "push", "mine.zip", "me/td3", "--env", ENV, *words])
+    with pytest.raises(SystemExit, match=message):
+        cli.main()
+    assert "actor alone" not in capsys.readouterr().out

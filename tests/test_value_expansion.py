@@ -1,8 +1,11 @@
 """Targets of the critics that go on in the simulator, against a plain loop over the environment."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch as th
+from gymnasium.envs.mujoco import inverted_pendulum_v5
 from sb3_contrib.common.torch_layers import BatchRenorm1d
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
@@ -203,6 +206,23 @@ def test_an_edited_simulator_is_followed_without_any_search(make_agent):
     model.set_roots(agent.planner.read_states(), np.zeros(1, int), np.random.default_rng(0))
     action = np.array([[2.0]], dtype=np.float32)
     np.testing.assert_array_equal(model.step(action).observations[0], env.step(action[0])[0])
+
+
+@pytest.mark.parametrize("branch_length", [0, 6])
+def test_states_of_a_simulator_with_others_are_dropped(make_agent, branch_length, tmp_path):
+    agent = make_agent(
+        "InvertedPendulum-v5", value_expansion=2, search_share=0.0, branch_length=branch_length
+    ).learn(40)
+    model = Path(inverted_pendulum_v5.__file__).parent / "assets" / "inverted_pendulum.xml"
+    ball = '<body pos="0 0 5"><geom type="sphere" size="0.1" contype="0" conaffinity="0"/></body>'
+    (tmp_path / "ball.xml").write_text(model.read_text().replace("</worldbody>", ball + "</worldbody>"))
+    env_kwargs = {"xml_file": str(tmp_path / "ball.xml")}
+    agent.set_env(snapshot_vec_env("InvertedPendulum-v5", env_kwargs=env_kwargs))
+    assert not agent.replay_buffer.expansion_held.any()
+    agent.train(1, batch_size=16)
+    agent.learn(30, reset_num_timesteps=False)
+    held = agent.replay_buffer.expansion_held
+    assert held[40:70].any() and not held[:40].any()
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

@@ -109,6 +109,18 @@ def test_schedules_are_tuned_when_asked(
         sample({**params, "rollout_depth": 0, "n_simulations": 1})
 
 
+def test_trials_without_value_expansion_have_no_branches(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(sampler.SWITCH, "schedules")
+    params = {**SEARCH, "search_schedule": "constant", "search_share": 0.5, "search_unit": "step"}
+    file = {"value_expansion": 2, "branch_length": 20}
+    for value_expansion in sampler.VALUE_EXPANSION:
+        trial = optuna.trial.FixedTrial({**params, "value_expansion": value_expansion})
+        trial.set_user_attr(sampler.HELD, file)
+        sampled = sampler.sample_mcbs_params("crossq", trial, 1, 1, dict(NO_HER))
+        assert ({**file, **sampled}["branch_length"] > 0) == (value_expansion > 0)
+        assert sampled == sampler.convert_mcbs_params(trial.params)
+
+
 def search_settings(params: dict[str, Any]) -> SearchSettings:
     """What a trial searches with, whatever preset the hyperparameter file names."""
     file = {"preset": "strong"}

@@ -1,27 +1,23 @@
 """Simulated transitions of the current actor, from which the critics and the actor learn.
 
 Rollouts branch off stored states and follow the current actor for some steps, as in MBPO (Janner et al.,
-2019), with the simulator as the model: every transition is exact, and none is older than
+2019), with the simulator as the model: every transition is exact, and hardly any is older than
 :data:`KEPT_UPDATES` gradient steps.
 """
 
 import math
-from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
-from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_mcbs.networks.functions import STOCHASTIC, target_actor
 from sb3_mcbs.networks.torch_settings import one_thread
-from sb3_mcbs.types import Observations, map_arrays, put_rows, take_rows
-
-Samples = ReplayBufferSamples | DictReplayBufferSamples
 
 #: How often a transition is learned from, on average. Fewer uses cost simulated steps and brought nothing.
 USES = 2
-#: Gradient steps whose transitions are kept.
+#: Gradient steps whose transitions are kept; more where rollouts ended early.
 KEPT_UPDATES = 400
 
 
@@ -37,18 +33,18 @@ def n_rollouts(n_sampled: int, n_steps: int) -> int:
 class _Step(NamedTuple):
     """One simulated step of some rollouts.
 
-    :param before: ``[m, *]``, observations, as the environment returns them.
+    :param before: ``[m, obs_dim]``, observations, as the environment returns them.
     :param actions: ``[m, act_dim]``, scaled.
-    :param after: ``[m, *]``, the next observations.
+    :param after: ``[m, obs_dim]``, the next observations.
     :param rewards: ``[m]``, scaled for the networks.
     :param bonus: ``[m]``, of the entropy of the actions.
     :param terminated: ``[m]`` bool.
     :param valid: ``[m]`` bool, whether the rollout had not ended before, and the step did not diverge.
     """
 
-    before: Observations
+    before: np.ndarray
     actions: np.ndarray
-    after: Observations
+    after: np.ndarray
     rewards: np.ndarray
     bonus: np.ndarray
     terminated: np.ndarray
@@ -68,7 +64,7 @@ class Branches:
 
     :ivar shape: ``(n, n_steps, length)``.
     :ivar states: ``[n, state_size]``, where the rollouts are at present.
-    :ivar observations: ``[n, *]`` there, as the environment returns them.
+    :ivar observations: ``[n, obs_dim]`` there, as the environment returns them.
     :ivar left: ``[n]``, steps that are left of them; 0 where none has begun.
     :ivar transitions: first observations, actions, last observations, whether terminated, discounted
         returns and discounts: ``[capacity, *]`` each.
@@ -78,21 +74,17 @@ class Branches:
     def __init__(self, buffer: Any, n: int, n_steps: int, length: int) -> None:
         self.shape = n, n_steps, length
         self.states = np.zeros((n, buffer.expansion_states.shape[-1]))
-        self.observations: Any = map_arrays(
-            lambda a: np.zeros((n, *a.shape[2:]), a.dtype), buffer.observations
-        )
+        self.observations = np.zeros((n, *buffer.observations.shape[2:]), buffer.observations.dtype)
         self.left = np.zeros(n, dtype=int)
         self._is_new = True
 
         def rows(a: np.ndarray) -> np.ndarray:
             return np.zeros((KEPT_UPDATES * n * n_steps, *a.shape[2:]), a.dtype)
 
-        first: Any = map_arrays(rows, buffer.observations)
-        last: Any = map_arrays(rows, buffer.observations)
-        self.transitions: tuple[Any, ...] = (
-            first,
+        self.transitions = (
+            rows(buffer.observations),
             rows(buffer.actions),
-            last,
+            rows(buffer.observations),
             rows(buffer.rewards[..., None]),
             rows(buffer.rewards[..., None]),
             rows(buffer.rewards[..., None]),
@@ -101,6 +93,14 @@ class Branches:
 
     def __len__(self) -> int:
         return min(self.n_added, len(self.transitions[1]))
+
+    def fits(self, buffer: Any, shape: tuple[int, int, int]) -> bool:
+        """Whether these are branches of this shape, with states as the replay buffer's.
+
+        :param buffer: the replay buffer.
+        :param shape: see :attr:`shape`.
+        """
+        return self.shape == shape and self.states.shape[1] == buffer.expansion_states.shape[2]
 
     def go_on(self, buffer: Any, agent: Any, rng: np.random.Generator, env: VecNormalize | None) -> None:
         """Continue the rollouts.
@@ -125,7 +125,7 @@ class Branches:
         held = buffer.expansion_held[at]
         ended, at = ended[held], (at[0][held], at[1][held])
         self.states[ended] = buffer.expansion_states[at]
-        put_rows(self.observations, ended, map_arrays(itemgetter(at), buffer.next_observations), slice(None))
+        self.observations[ended] = buffer.next_observations[at]
         length = self.shape[2]
         # The first ones end at different times, so that later ones do not begin all at once.
         self.left[ended] = rng.integers(1, length + 1, len(ended)) if self._is_new else length
@@ -143,8 +143,8 @@ class Branches:
         model, view = planner.model, planner.source.view
         act = target_actor(agent)
         model.set_roots(list(self.states[going]), np.arange(len(going)), rng)
-        before = take_rows(self.observations, going)
-        seen: Any = buffer._normalize_obs(before, env)
+        before = self.observations[going]
+        seen = buffer._normalize_obs(before, env)
         goes_on = np.ones(len(going), dtype=bool)
         steps = []
         for _ in range(n_steps):
@@ -154,13 +154,15 @@ class Branches:
                 actions = np.clip(actions + noise, -1, 1)
             step = model.step(planner.unscale(actions))
             agent.n_simulated_steps += len(going)
-            after = view.observe(step.observations, normalize=False)
+            after: Any = view.observe(step.observations, normalize=False)
             rewards = buffer._normalize_reward(step.rewards, env)
             steps.append(_Step(before, actions, after, rewards, bonus, step.terminated, goes_on & step.valid))
             goes_on = goes_on & step.goes_on
-            before, seen = after, view.observe(step.observations)
+            # The actor gets nothing that is not finite.
+            seen = np.where(step.valid[:, None], view.observe(step.observations), seen)
+            before = after
         self.states[going] = model.rows()
-        put_rows(self.observations, going, after, slice(None))
+        self.observations[going] = after
         self.left[going] = np.where(goes_on, self.left[going] - n_steps, 0)
         return steps
 
@@ -172,35 +174,36 @@ class Branches:
         """
         returns = bonus = np.zeros(len(steps[0].rewards))
         lengths = np.zeros(len(returns), dtype=int)
-        last = map_arrays(np.copy, steps[-1].after)
+        last = steps[-1].after.copy()
         terminated = np.zeros(len(returns), dtype=bool)
         followed = np.zeros(len(returns), dtype=bool)
         for step in reversed(steps):
             ends = step.valid & ~followed
             returns = step.rewards + np.where(followed, gamma * (bonus + returns), 0.0)
             lengths = np.where(followed, lengths + 1, 1)
-            put_rows(last, ends, step.after, ends)
+            last[ends] = step.after[ends]
             terminated[ends] = step.terminated[ends]
-            self._add(step, take_rows(last, step.valid), terminated, returns, gamma**lengths)
+            self._add(step, last, terminated, returns, gamma**lengths)
             followed, bonus = step.valid, step.bonus
 
-    def _add(self, step: _Step, last: Observations, *columns: np.ndarray) -> None:
+    def _add(self, step: _Step, last: np.ndarray, *columns: np.ndarray) -> None:
         """Add one transition of each rollout that was going.
 
         :param step: its first step.
-        :param last: ``[valid, *]``, where its target bootstraps.
+        :param last: ``[m, obs_dim]``, where its target bootstraps.
         :param columns: ``[m]``: whether it terminated there, the discounted return until there, the discount.
         """
         valid = step.valid
         n = int(valid.sum())
         rows = (self.n_added + np.arange(n)) % len(self.transitions[1])
-        first = take_rows(step.before, valid)
-        values = first, step.actions[valid], last, *(column[valid, None] for column in columns)
+        values = step.before, step.actions, last, *(column[:, None] for column in columns)
         for kept, new in zip(self.transitions, values, strict=True):
-            put_rows(kept, rows, new, slice(None))
+            kept[rows] = new[valid]
         self.n_added += n
 
-    def sample(self, n: int, buffer: Any, rng: np.random.Generator, env: VecNormalize | None) -> Samples:
+    def sample(
+        self, n: int, buffer: Any, rng: np.random.Generator, env: VecNormalize | None
+    ) -> ReplayBufferSamples:
         """Sample the kept transitions.
 
         :param n: how many.
@@ -209,13 +212,11 @@ class Branches:
         :param env: normalises observations.
         """
         rows = rng.integers(0, len(self), n)
-        first, actions, last, terminated, returns, discounts = (take_rows(a, rows) for a in self.transitions)
-        seen: Any = buffer._normalize_obs(first, env)
-        samples = DictReplayBufferSamples if isinstance(seen, dict) else ReplayBufferSamples
-        return samples(
-            map_arrays(buffer.to_torch, seen),
+        first, actions, last, terminated, returns, discounts = (array[rows] for array in self.transitions)
+        return ReplayBufferSamples(
+            buffer.to_torch(buffer._normalize_obs(first, env)),
             buffer.to_torch(actions),
-            map_arrays(buffer.to_torch, buffer._normalize_obs(last, env)),
+            buffer.to_torch(buffer._normalize_obs(last, env)),
             buffer.to_torch(terminated),
             buffer.to_torch(returns),
             buffer.to_torch(discounts),

@@ -8,19 +8,17 @@ are exact, actions are not old ones as with ``n_steps``, and values propagate se
 
 import functools
 import logging
-from collections.abc import Sequence
 from dataclasses import dataclass
-from operator import itemgetter
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples, RolloutReturn
+from stable_baselines3.common.type_aliases import ReplayBufferSamples, RolloutReturn
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_mcbs.agents.branches import Branches, Samples, n_rollouts
+from sb3_mcbs.agents.branches import Branches, n_rollouts
 from sb3_mcbs.agents.checked_rollouts import CheckedRollouts
 from sb3_mcbs.agents.compiled_policy import CompiledPolicy, way
 from sb3_mcbs.agents.planner import Planner
@@ -30,7 +28,6 @@ from sb3_mcbs.networks.functions import STOCHASTIC, target_actor
 from sb3_mcbs.networks.torch_settings import one_thread
 from sb3_mcbs.search import SearchSettings
 from sb3_mcbs.search.checks import CheckedSettings
-from sb3_mcbs.types import Observations, map_arrays, put_rows, take_rows
 
 logger = logging.getLogger("sb3_mcbs")
 
@@ -148,9 +145,10 @@ class ExpandedReplayBuffer(ReplayBuffer):
         :param done: ``[n_envs]``, whether the episode ended: the state is then of the next one.
         """
         states, self.states_after = self.states_after, None
-        self.expansion_held[self.pos] = False if states is None else ~np.asarray(done, dtype=bool)
         if states is not None:
+            make_room(self, states.shape[1])
             self.expansion_states[self.pos] = states
+        self.expansion_held[self.pos] = False if states is None else ~np.asarray(done, dtype=bool)
         super().add(obs, next_obs, action, reward, done, infos)
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> Any:
@@ -162,7 +160,7 @@ class ExpandedReplayBuffer(ReplayBuffer):
         """
         agent = self.expanding_agent
         n_expanded = round(agent.expanded_share * batch_size)
-        branches: Branches | None = agent.go_on_with_branches(n_expanded, env) if n_expanded else None
+        branches: Branches | None = agent.go_on_with_branches(env) if n_expanded else None
         if branches is not None and not len(branches):
             n_expanded = 0  # no stored state to branch off
         samples = []
@@ -175,9 +173,11 @@ class ExpandedReplayBuffer(ReplayBuffer):
             samples.append(branches.sample(n_expanded, self, agent.rollout_rng, env))
         elif n_expanded:
             samples.append(self.sample_expanded(n_expanded, agent.rollout_rng, env))
-        return type(samples[0])(*(_joined(fields) for fields in zip(*samples, strict=True)))
+        return ReplayBufferSamples(*(th.cat(fields) for fields in zip(*samples, strict=True)))
 
-    def sample_expanded(self, n: int, rng: np.random.Generator, env: VecNormalize | None) -> Samples:
+    def sample_expanded(
+        self, n: int, rng: np.random.Generator, env: VecNormalize | None
+    ) -> ReplayBufferSamples:
         """Sample transitions, and roll them forward.
 
         :param n: number of transitions.
@@ -189,7 +189,7 @@ class ExpandedReplayBuffer(ReplayBuffer):
             np.array(self._normalize_reward(self.rewards[at], env), dtype=np.float64),
             np.ones(n, dtype=int),
             (self.dones[at] * (1 - self.timeouts[at])).astype(bool),
-            map_arrays(itemgetter(at), self.next_observations),
+            self.next_observations[at],
         )
         going = np.flatnonzero(self.expansion_held[at])
         if len(going):
@@ -220,7 +220,7 @@ class ExpandedReplayBuffer(ReplayBuffer):
         agent, planner = self.expanding_agent, self.expanding_agent.planner
         model, view = planner.model, planner.source.view
         model.set_roots(list(states), np.arange(len(going)), rng)
-        seen: Any = self._normalize_obs(take_rows(last, going), env)
+        seen: Any = self._normalize_obs(last[going], env)
         act = target_actor(agent)
         for number in range(1, agent.value_expansion + 1):
             actions, bonus = act(seen, rng)
@@ -232,11 +232,12 @@ class ExpandedReplayBuffer(ReplayBuffer):
             returns[at] += agent.gamma**number * rewards
             terminated[at] = step.terminated[valid]
             lengths[at] += 1
-            put_rows(last, at, view.observe(step.observations, normalize=False), valid)
+            after: Any = view.observe(step.observations, normalize=False)
+            last[at] = after[valid]
             still = np.flatnonzero(step.goes_on)
             if not len(still):
                 return
-            seen = take_rows(view.observe(step.observations), still)
+            seen = view.observe(step.observations)[still]
             if len(still) < len(going):
                 model.select(still)
                 going = going[still]
@@ -254,28 +255,28 @@ class ExpandedReplayBuffer(ReplayBuffer):
         except TypeError:
             return False
         returns, lengths, terminated, last = path
-        begin: Any = take_rows(last, going)  # no dictionary: compiled code does not cover those
-        rolled = compiled.follow(list(states), begin, agent.value_expansion)
+        rolled = compiled.follow(list(states), last[going], agent.value_expansion)
         agent.n_simulated_steps += rolled.simulated_steps
         returns[going] += agent.gamma * rolled.returns[:, 0]
         lengths[going] += rolled.lengths[:, 0]
         simulated = rolled.lengths[:, 0] > 0
         terminated[going[simulated]] = rolled.terminated[simulated, 0]
-        put_rows(last, going[simulated], rolled.observations[:, 0], simulated)
+        last[going[simulated]] = rolled.observations[simulated, 0]
         return True
 
-    def _as_samples(self, at: tuple[np.ndarray, ...], path: "_Path", env: VecNormalize | None) -> Samples:
+    def _as_samples(
+        self, at: tuple[np.ndarray, ...], path: "_Path", env: VecNormalize | None
+    ) -> ReplayBufferSamples:
         """Make a batch, with discounts for the next observations' values.
 
         :param at: rows and environments ``[n]`` of the transitions.
         """
-        first: Any = self._normalize_obs(map_arrays(itemgetter(at), self.observations), env)
+        first: Any = self._normalize_obs(self.observations[at], env)
         last: Any = self._normalize_obs(path.observations, env)
-        samples = DictReplayBufferSamples if isinstance(first, dict) else ReplayBufferSamples
-        return samples(
-            map_arrays(self.to_torch, first),
+        return ReplayBufferSamples(
+            self.to_torch(first),
             self.to_torch(self.actions[at]),
-            map_arrays(self.to_torch, last),
+            self.to_torch(last),
             self.to_torch(path.terminated.astype(np.float32)[:, None]),
             self.to_torch(path.returns.astype(np.float32)[:, None]),
             self.to_torch((self.expanding_agent.gamma**path.lengths).astype(np.float32)[:, None]),
@@ -297,13 +298,25 @@ def expand(buffer: ReplayBuffer, agent: Any) -> None:
     :raises ForwardModelError: if the forward model's states are not arrays.
     """
     if not isinstance(buffer, ExpandedReplayBuffer):
-        shape = (buffer.buffer_size, buffer.n_envs, batched_states(agent).shape[1])
-        held: Any = buffer
-        if getattr(held, "expansion_states", np.zeros(0)).shape != shape:
-            held.expansion_states = np.zeros(shape)
-            held.expansion_held = np.zeros(shape[:2], dtype=bool)
-        held.__class__ = _expanded_class(type(buffer))
+        make_room(buffer, batched_states(agent).shape[1])
+        buffer.__class__ = _expanded_class(type(buffer))
     vars(buffer)["expanding_agent"] = agent
+
+
+def make_room(buffer: ReplayBuffer, state_size: int) -> None:
+    """Give a replay buffer room for states. It loses those of a simulator with other states.
+
+    :param buffer: the replay buffer.
+    :param state_size: of the present simulator.
+    """
+    held: Any = buffer
+    shape = (buffer.buffer_size, buffer.n_envs, state_size)
+    known = getattr(held, "expansion_states", None)
+    if known is None or known.shape != shape:
+        if known is not None:
+            logger.info("The replay buffer's states are dropped: they are those of another simulator.")
+        held.expansion_states = np.zeros(shape)
+        held.expansion_held = np.zeros(shape[:2], dtype=bool)
 
 
 @functools.cache
@@ -355,13 +368,13 @@ class _Path(NamedTuple):
     :param returns: ``[n]``, discounted sums of rewards, scaled for the networks.
     :param lengths: ``[n]``, numbers of steps.
     :param terminated: ``[n]`` bool, whether the environment ended the episode.
-    :param observations: ``[n, *]``, the last ones, as stored in replay buffers.
+    :param observations: ``[n, obs_dim]``, the last ones, as stored in replay buffers.
     """
 
     returns: np.ndarray
     lengths: np.ndarray
     terminated: np.ndarray
-    observations: Observations
+    observations: np.ndarray
 
 
 def compiled_target(agent: Any, env: VecNormalize | None) -> CompiledPolicy:
@@ -379,12 +392,6 @@ def compiled_target(agent: Any, env: VecNormalize | None) -> CompiledPolicy:
     return compiled
 
 
-def _joined(fields: Sequence[Any]) -> Any:
-    if isinstance(fields[0], dict):
-        return {key: th.cat([field[key] for field in fields]) for key in fields[0]}
-    return th.cat(list(fields))
-
-
 class Expanding(CheckedRollouts):
     """An agent whose critic targets are rolled forward if ``value_expansion`` is above 0.
 
@@ -394,6 +401,7 @@ class Expanding(CheckedRollouts):
     """
 
     value_expansion: int
+    expanded_share: float
     branch_length: int
     planner: Planner | None
     n_simulated_steps: int
@@ -421,26 +429,29 @@ class Expanding(CheckedRollouts):
         if self.replay_buffer is not None:  # it may have been taken away
             ValueExpansionSettings.of(self).check_buffer(self.replay_buffer.optimize_memory_usage)
 
-    def go_on_with_branches(self, n: int, env: VecNormalize | None) -> Branches | None:
-        """Continue the simulated rollouts, which begin anew if a setting changed their shape.
+    def go_on_with_branches(self, env: VecNormalize | None) -> Branches | None:
+        """Continue the simulated rollouts, which begin anew if settings or states are others.
 
-        :param n: how many transitions are sampled from them.
         :param env: normalises observations and rewards.
         :return: ``None`` without a ``branch_length``.
         """
         if not self.branch_length:
+            self.branches = None  # later they would be those of an old actor
             return None
-        shape = n_rollouts(n, self.value_expansion), self.value_expansion, self.branch_length
-        if self.branches is None or self.branches.shape != shape:
+        n_sampled = round(self.expanded_share * self.batch_size)
+        shape = n_rollouts(n_sampled, self.value_expansion), self.value_expansion, self.branch_length
+        if self.branches is None or not self.branches.fits(self.replay_buffer, shape):
             self.branches = Branches(self.replay_buffer, *shape)
         assert self.rollout_rng is not None
         self.branches.go_on(self.replay_buffer, self, self.rollout_rng, env)
         return self.branches
 
     def _check_states(self) -> None:
-        """Refuse a forward model whose states cannot be kept."""
+        """Refuse a forward model whose states cannot be kept, and drop states that it cannot go on from."""
         if self.value_expansion:
-            batched_states(self)
+            state_size = batched_states(self).shape[1]
+            if isinstance(self.replay_buffer, ExpandedReplayBuffer):
+                make_room(self.replay_buffer, state_size)
 
     def _expand_buffer(self) -> None:
         """Convert the replay buffer, before every use, since loading one replaces it."""

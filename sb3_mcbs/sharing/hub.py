@@ -79,7 +79,7 @@ def push_to_hub(
     :return: the address of the commit
     :raises ImportError: if ``huggingface_hub`` is not installed
     """
-    hub = _import_hub()
+    hub = import_hub()
     with tempfile.TemporaryDirectory() as folder:
         write_repository(Path(folder), repo_id, file, policy, environment, returns, video)
         api = hub.HfApi(token=token)
@@ -114,7 +114,7 @@ def load_from_hub(
     :raises ImportError: if ``huggingface_hub`` is not installed
     :raises AgentFileError: if the repository has no agent, or one that cannot be read safely
     """
-    hub = _import_hub()
+    hub = import_hub()
     patterns = ["*.zip", "*.npz", SEARCH, _PICKLE]
     folder = hub.snapshot_download(
         repo_id, revision=revision, token=token, allow_patterns=patterns, ignore_patterns=list(_NOT_AGENTS)
@@ -122,12 +122,30 @@ def load_from_hub(
     return read_repository(Path(folder), env, normalize_reward, **settings)
 
 
-def _import_hub() -> Any:
+def import_hub() -> Any:
+    """
+    :return: ``huggingface_hub``
+    :raises ImportError: if it is not installed
+    """
     try:
         import huggingface_hub
     except ImportError as error:
         raise ImportError("The hub needs huggingface_hub: pip install 'sb3-mcbs[hub]'") from error
     return huggingface_hub
+
+
+def check_video(video: str | Path | None) -> None:
+    """
+    :param video: what a model card shall show, if anything
+    :raises FileNotFoundError: if it is not there
+    :raises ValueError: if it is of another kind
+    """
+    if video is None:
+        return
+    if Path(video).suffix not in _VIDEOS:
+        raise ValueError(f"A model card shows .mp4 and .gif, not {video}.")
+    if not Path(video).is_file():
+        raise FileNotFoundError(f"There is no video {video}.")
 
 
 def write_repository(
@@ -146,8 +164,7 @@ def write_repository(
     :raises FileNotFoundError: if there is no such agent or video
     :raises ValueError: if the video is of another kind
     """
-    if video is not None and Path(video).suffix not in _VIDEOS:
-        raise ValueError(f"A model card shows .mp4 and .gif, not {video}.")
+    check_video(video)
     shutil.copyfile(file, folder / AGENT)
     normalizer = unwrap_vec_normalize(policy.vec_env)
     if normalizer is not None:

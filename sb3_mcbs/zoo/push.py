@@ -5,7 +5,7 @@ from pathlib import Path
 
 from sb3_mcbs.search import PRESETS
 from sb3_mcbs.sharing import push_to_hub
-from sb3_mcbs.sharing.hub import write_repository
+from sb3_mcbs.sharing.hub import check_video, import_hub, write_repository
 from sb3_mcbs.zoo.arguments import add_agent, errors_in_words, whole_number
 from sb3_mcbs.zoo.evaluate import evaluate, searching_policies
 from sb3_mcbs.zoo.subject import DEFAULT_PRESET, find_subject
@@ -39,6 +39,21 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _check_destination(folder: Path | None, video: Path | None) -> None:
+    """
+    :param folder: made here; None: the hub
+    :param video: see :func:`push_to_hub`
+    :raises FileExistsError: if the folder is there already
+    """
+    check_video(video)
+    if folder is None:
+        import_hub()
+    elif folder.exists():
+        raise FileExistsError(f"{folder} is there already: name a folder that is not.")
+    else:
+        folder.mkdir(parents=True)
+
+
 def main() -> None:
     """Read the command line, evaluate and upload."""
     parser = _parser()
@@ -48,6 +63,7 @@ def main() -> None:
         subject = find_subject(args)
         env = subject.make_env()
         agent = subject.load(env)
+        _check_destination(args.folder, args.video)  # before what takes long
         returns = {}
         for result in evaluate(agent, env, presets, range(args.seed, args.seed + args.episodes)):
             returns[result.policy] = [episode.total for episode in result.episodes]
@@ -57,7 +73,6 @@ def main() -> None:
             about = (args.repo_id, subject.file, policy, subject.environment, returns)
             print(push_to_hub(*about, video=args.video, private=args.private))
             return
-        args.folder.mkdir(parents=True)
         write_repository(
             args.folder, args.repo_id, subject.file, policy, subject.environment, returns, args.video
         )

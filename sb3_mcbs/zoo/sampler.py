@@ -168,6 +168,8 @@ def _search_settings(sampled: dict[str, Any]) -> dict[str, Any]:
     if sampled.get("proposal_factor", 1) > 1:
         n_kept = settings["beam_width"] * kwargs.get("branching", 1)
         kwargs["n_proposals"] = sampled["proposal_factor"] * n_kept
+    if settings.get("value_expansion") == 0:
+        settings["branch_length"] = 0  # the file's would not go with it
     if "strategy" in sampled:
         settings["strategy"] = present_name(sampled["strategy"])
         settings["search_kwargs"] = kwargs
