@@ -346,7 +346,7 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
         result = super()._setup_learn(*args, **kwargs)
         if self._total_timesteps:  # the progress is still that of the previous training
             self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
-        if self.num_timesteps == 0:  # a training that goes on has written them
+        if self.num_timesteps == 0 and self._stopped_run is None:  # one that goes on has written them
             write_hyperparameters(self)
         return result
 
