@@ -11,8 +11,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_mcbs import MCBSDDPG, MCBSSAC, MCBSTD3, MCBSCrossQ
 from sb3_mcbs.agents.compiled_policy import CompiledPolicy
+from sb3_mcbs.agents.expanded_buffer import ExpandedReplayBuffer
 from sb3_mcbs.agents.planner import Planner
-from sb3_mcbs.agents.value_expansion import ExpandedReplayBuffer
 from sb3_mcbs.models.compiled_networks import actions_of, values_of
 from sb3_mcbs.networks.functions import policy_function, value_function
 from sb3_mcbs.search import BeamSettings, CEMSettings, Roots, search

@@ -13,7 +13,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 
 from sb3_mcbs import MCBSDDPG, MCBSSAC, MCBSTD3, MCBSTQC, MCBSCrossQ, SearchPolicy
-from sb3_mcbs.agents.value_expansion import ExpandedReplayBuffer
+from sb3_mcbs.agents.expanded_buffer import ExpandedReplayBuffer
 from sb3_mcbs.models import ForwardModelError
 from sb3_mcbs.networks.functions import STOCHASTIC, policy_function, soft_policy_function
 from tests.conftest import SEARCHING, snapshot_vec_env
