@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_mcbs.networks.functions import STOCHASTIC, target_actor
 from sb3_mcbs.networks.torch_settings import one_thread
 
-#: How often a transition is learned from, on average. Fewer uses cost simulated steps and brought nothing.
+#: How often a transition is learned from, on average.
 USES = 2
 #: Gradient steps whose transitions are kept; more where rollouts ended early.
 KEPT_UPDATES = 400
