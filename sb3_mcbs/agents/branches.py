@@ -30,6 +30,34 @@ def n_rollouts(n_sampled: int, n_steps: int) -> int:
     return math.ceil(n_sampled / (USES * n_steps))
 
 
+def as_samples(
+    buffer: Any,
+    env: VecNormalize | None,
+    first: np.ndarray,
+    actions: np.ndarray,
+    last: np.ndarray,
+    *columns: np.ndarray,
+) -> ReplayBufferSamples:
+    """Convert transitions for the networks.
+
+    :param buffer: the replay buffer that they stand beside.
+    :param env: normalises observations.
+    :param first: ``[n, obs_dim]``, observations as the environment returns them.
+    :param actions: ``[n, act_dim]``, scaled.
+    :param last: ``[n, obs_dim]``, where the targets bootstrap.
+    :param columns: ``[n, 1]`` float32: whether they terminated there, discounted returns, discounts.
+    """
+    terminated, returns, discounts = map(buffer.to_torch, columns)
+    return ReplayBufferSamples(
+        buffer.to_torch(buffer._normalize_obs(first, env)),
+        buffer.to_torch(actions),
+        buffer.to_torch(buffer._normalize_obs(last, env)),
+        terminated,
+        returns,
+        discounts,
+    )
+
+
 class _Step(NamedTuple):
     """One simulated step of some rollouts.
 
@@ -159,7 +187,7 @@ class Branches:
             steps.append(_Step(before, actions, after, rewards, bonus, step.terminated, goes_on & step.valid))
             goes_on = goes_on & step.goes_on
             # The actor gets nothing that is not finite.
-            seen = np.where(step.valid[:, None], view.observe(step.observations), seen)
+            seen = np.where(step.valid[:, None], buffer._normalize_obs(after, env), seen)
             before = after
         self.states[going] = model.rows()
         self.observations[going] = after
@@ -212,12 +240,4 @@ class Branches:
         :param env: normalises observations.
         """
         rows = rng.integers(0, len(self), n)
-        first, actions, last, terminated, returns, discounts = (array[rows] for array in self.transitions)
-        return ReplayBufferSamples(
-            buffer.to_torch(buffer._normalize_obs(first, env)),
-            buffer.to_torch(actions),
-            buffer.to_torch(buffer._normalize_obs(last, env)),
-            buffer.to_torch(terminated),
-            buffer.to_torch(returns),
-            buffer.to_torch(discounts),
-        )
+        return as_samples(buffer, env, *(array[rows] for array in self.transitions))

@@ -10,7 +10,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_mcbs.agents.branches import Branches
+from sb3_mcbs.agents.branches import Branches, as_samples
 from sb3_mcbs.agents.compiled_policy import CompiledPolicy
 from sb3_mcbs.models import ForwardModelError
 from sb3_mcbs.networks.functions import STOCHASTIC, target_actor
@@ -185,16 +185,9 @@ class ExpandedReplayBuffer(ReplayBuffer):
 
         :param at: rows and environments ``[n]`` of the transitions.
         """
-        first: Any = self._normalize_obs(self.observations[at], env)
-        last: Any = self._normalize_obs(path.observations, env)
-        return ReplayBufferSamples(
-            self.to_torch(first),
-            self.to_torch(self.actions[at]),
-            self.to_torch(last),
-            self.to_torch(path.terminated.astype(np.float32)[:, None]),
-            self.to_torch(path.returns.astype(np.float32)[:, None]),
-            self.to_torch((self.expanding_agent.gamma**path.lengths).astype(np.float32)[:, None]),
-        )
+        discounts = self.expanding_agent.gamma**path.lengths
+        columns = (c.astype(np.float32)[:, None] for c in (path.terminated, path.returns, discounts))
+        return as_samples(self, env, self.observations[at], self.actions[at], path.observations, *columns)
 
     def __reduce_ex__(self, protocol: Any) -> Any:
         held: Any = self.__getstate__()

@@ -47,9 +47,9 @@ class GradientSteps(OffPolicyAlgorithm):
         """Whether gradient steps shall be captured."""
         return checked_switch(self, "cuda_graphs") and self.device.type in BACKENDS
 
-    @abstractmethod
     def _wants_update(self) -> bool:
-        """Whether the settings ask for the :class:`Update`."""
+        """Whether the settings ask for the :class:`Update`; by default, only to capture it."""
+        return self._in_graphs
 
     @abstractmethod
     def _make_update(self) -> Update:

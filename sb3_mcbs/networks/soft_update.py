@@ -177,8 +177,7 @@ class SACUpdate(SoftUpdate):
             loss = (alpha * log_prob - self._values(data.observations, actions)).mean()
         losses["actor_loss"] = self._descend(0, loss)
         if kind:
-            th._foreach_mul_(self._critic_targets, 1 - self._agent.tau)
-            th._foreach_add_(self._critic_targets, self._critics, alpha=self._agent.tau)
+            self.update_targets(self._critic_targets, self._critics)
         return losses
 
     def _next_values(self, observations: th.Tensor, actions: th.Tensor) -> th.Tensor:
@@ -324,9 +323,6 @@ class SACSteps(GradientSteps, SAC):
 
     _sb3s_train = SAC.train
 
-    def _wants_update(self) -> bool:
-        return self._in_graphs
-
     def _make_update(self) -> SACUpdate:
         return SACUpdate(self)
 
@@ -335,9 +331,6 @@ class TQCSteps(GradientSteps, TQC):
     """TQC, or a subclass of it, whose gradient steps on a GPU are captured in CUDA graphs."""
 
     _sb3s_train = TQC.train
-
-    def _wants_update(self) -> bool:
-        return self._in_graphs
 
     def _make_update(self) -> TQCUpdate:
         return TQCUpdate(self)
@@ -352,9 +345,6 @@ class CrossQSteps(GradientSteps, CrossQ):
     #: ``False`` computes batch renormalization as SB3-Contrib does.
     fast_update: bool
     _sb3s_train = CrossQ.train
-
-    def _wants_update(self) -> bool:
-        return self._in_graphs
 
     def _make_update(self) -> CrossQUpdate:
         if not self.fast_update:

@@ -146,8 +146,7 @@ class TD3Update(Update):
 
     def _update_target_networks(self) -> None:
         for targets, networks in self._targets_and_networks:
-            th._foreach_mul_(targets, 1 - self._agent.tau)
-            th._foreach_add_(targets, networks, alpha=self._agent.tau)
+            self.update_targets(targets, networks)
 
 
 #: What TD3's ``train`` calls besides networks and optimizers; a user may replace it.

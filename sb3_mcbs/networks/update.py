@@ -32,8 +32,8 @@ class Update:
 
     def __init__(self, agent: Any, optimizers: Sequence[th.optim.Optimizer]) -> None:
         self._agent, self._optimizers = agent, list(optimizers)
-        #: The optimizers' learning rates, where captured steps read them.
         self._counts = HostCounts()
+        #: The optimizers' learning rates, where captured steps read them.
         self._rates: Sequence[th.Tensor | None] = [None] * len(self._optimizers)
 
     @abstractmethod
@@ -72,6 +72,15 @@ class Update:
     def adam_step(self, index: int) -> None:
         """Step one of the optimizers."""
         adam.adam_step(self._optimizers[index], self._rates[index])
+
+    def update_targets(self, targets: list[th.Tensor], networks: list[th.Tensor]) -> None:
+        """Move target networks towards networks, by the agent's ``tau``.
+
+        :param targets: their parameters.
+        :param networks: those of the networks, in the same order.
+        """
+        th._foreach_mul_(targets, 1 - self._agent.tau)
+        th._foreach_add_(targets, networks, alpha=self._agent.tau)
 
     def train(self, gradient_steps: int, batch_size: int) -> None:
         """Do what the agent's own ``train`` does.

@@ -41,6 +41,20 @@ def add_agent(parser: argparse.ArgumentParser) -> None:
     add_statistics(parser)
 
 
+def add_episodes(parser: argparse.ArgumentParser) -> None:
+    """
+    Add how many episodes are played, and the reset seed of the first.
+
+    :param parser: of a command
+    """
+    parser.add_argument(
+        "--episodes", type=whole_number(1), metavar="N", default=10, help="episodes to play, by default 10"
+    )
+    parser.add_argument(
+        "--seed", type=whole_number(0), metavar="N", default=0, help="reset seed of the first, by default 0"
+    )
+
+
 def add_wrappers(parser: argparse.ArgumentParser) -> None:
     """
     :param parser: of a command

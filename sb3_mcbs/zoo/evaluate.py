@@ -15,7 +15,7 @@ from sb3_mcbs.agents import SearchPolicy
 from sb3_mcbs.agents.episodes import Episode, play
 from sb3_mcbs.search import PRESETS
 from sb3_mcbs.types import Preset
-from sb3_mcbs.zoo.arguments import add_agent, errors_in_words, whole_number
+from sb3_mcbs.zoo.arguments import add_agent, add_episodes, errors_in_words
 from sb3_mcbs.zoo.evaluations import ACTOR, SEARCH
 from sb3_mcbs.zoo.subject import DEFAULT_PRESET, Subject, default_preset, find_subject
 from sb3_mcbs.zoo.watch import record
@@ -120,12 +120,7 @@ def _parser() -> argparse.ArgumentParser:
         default=[],
         help=f"how to search ({', '.join(PRESETS)}); by default as in training, or {DEFAULT_PRESET}",
     )
-    parser.add_argument(
-        "--episodes", type=whole_number(1), metavar="N", default=10, help="how many, by default 10"
-    )
-    parser.add_argument(
-        "--seed", type=whole_number(0), metavar="N", default=0, help="reset seed of the first, by default 0"
-    )
+    add_episodes(parser)
     parser.add_argument(
         "--video",
         type=Path,

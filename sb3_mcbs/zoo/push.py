@@ -6,7 +6,7 @@ from pathlib import Path
 from sb3_mcbs.search import PRESETS
 from sb3_mcbs.sharing import push_to_hub
 from sb3_mcbs.sharing.hub import check_video, import_hub, write_repository
-from sb3_mcbs.zoo.arguments import add_agent, errors_in_words, whole_number
+from sb3_mcbs.zoo.arguments import add_agent, add_episodes, errors_in_words
 from sb3_mcbs.zoo.evaluate import evaluate, searching_policies
 from sb3_mcbs.zoo.subject import DEFAULT_PRESET, find_subject
 
@@ -25,12 +25,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="PRESET",
         help=f"how to search ({', '.join(PRESETS)}); by default as in training, or {DEFAULT_PRESET}",
     )
-    parser.add_argument(
-        "--episodes", type=whole_number(1), metavar="N", default=10, help="to evaluate, by default 10"
-    )
-    parser.add_argument(
-        "--seed", type=whole_number(0), metavar="N", default=0, help="reset seed of the first"
-    )
+    add_episodes(parser)
     parser.add_argument("--video", type=Path, metavar="FILE", help="from sb3-mcbs watch: .mp4 or .gif")
     parser.add_argument("--private", action="store_true", help="make the repository private")
     parser.add_argument(
