@@ -9,7 +9,8 @@ from stable_baselines3 import DDPG, SAC, TD3
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 
-from sb3_mcbs.networks.soft_update import CrossQSteps, SACSteps, TQCSteps
+from sb3_mcbs.networks.crossq_update import CrossQSteps
+from sb3_mcbs.networks.soft_update import SACSteps, TQCSteps
 from sb3_mcbs.networks.td3_update import FastUpdate
 
 

@@ -14,7 +14,6 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_mcbs.networks import batches, graphs
-from sb3_mcbs.networks.batch_renorm import fuse_batch_renorm
 from sb3_mcbs.networks.batches import CopiedBatches, MirroredBatches
 from tests.fake_graph import FakeBackend
 from tests.graph_helpers import GRAPHED, TANH, GraphTD3, SACSteps, agent_with_steps, assert_alike, train
@@ -78,7 +77,6 @@ def test_the_same_steps_run_eagerly(cls):
     theirs, ours = agent_with_steps(cls), agent_with_steps(GRAPHED[cls])
     train(theirs)
     ours.set_random_seed(1)
-    fuse_batch_renorm(ours.policy)
     for _ in range(20):
         ours._make_update().train(2, 16)
     assert_alike(theirs, ours)

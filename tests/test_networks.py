@@ -12,7 +12,7 @@ from stable_baselines3 import DDPG, SAC, TD3
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_mcbs import MCBSTD3, MCBSCrossQ
-from sb3_mcbs.networks.batch_renorm import FusedBatchRenorm1d, fuse_batch_renorm
+from sb3_mcbs.networks.batch_renorm import Renormalization
 from sb3_mcbs.networks.functions import policy_function, value_function
 from sb3_mcbs.networks.mlp import MLP
 from sb3_mcbs.networks.plain_networks import actor_mlp, critic_mlps
@@ -124,58 +124,61 @@ def test_batch_renormalization_that_is_not_covered():
 
 
 @pytest.mark.parametrize("warmup_steps", [10, -1])
-def test_fused_batch_renormalization_is_sb3_contribs(warmup_steps):
-    layers = [BatchRenorm1d(5, warmup_steps=warmup_steps).double() for _ in range(2)]
-    fuse_batch_renorm(layers[1])
+def test_batch_renormalization_is_sb3_contribs(warmup_steps):
+    theirs, ours = (BatchRenorm1d(5, warmup_steps=warmup_steps) for _ in range(2))
     th.manual_seed(0)
-    for layer in layers:
-        layer.ra_mean = th.linspace(-8, 8, 5, dtype=th.float64)  # clipped at both ends
-        layer.ra_var = th.linspace(0.1, 40, 5, dtype=th.float64)
-        layer.scale.data = th.linspace(-1, 2, 5, dtype=th.float64)
-    x, gradient = th.randn(2, 7, 5, dtype=th.float64)
-    results = []
-    for layer in layers:
-        given = (2 * x + 1).requires_grad_()
-        outputs = layer(given)
-        outputs.backward(gradient)
-        results.append([outputs, given.grad, *(p.grad for p in layer.parameters()), *layer.buffers()])
-        layer.eval()
-        results[-1].append(layer(x))
-    assert type(layers[1]) is FusedBatchRenorm1d
-    for expected, found in zip(*results, strict=True):
-        th.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)
+    for layer in (theirs, ours):
+        layer.ra_mean.copy_(th.linspace(-8, 8, 5))  # clipped at both ends
+        layer.ra_var.copy_(th.linspace(0.1, 40, 5))
+        layer.scale.data = th.linspace(-1, 2, 5)
+    x, gradient = th.randn(2, 70, 5)
+    given = (2 * x + 1).requires_grad_()
+    expected = theirs(given)
+    expected.backward(gradient)
+    renormalization = Renormalization(ours)
+    with th.no_grad():
+        found, kept = renormalization.train(given.t(), past_warmup=warmup_steps < 0)
+        of_input = renormalization.backward(kept, gradient.t().clone(), of_parameters=True, of_input=True)
+    pairs = [(found.t(), expected), (of_input.t(), given.grad)]
+    pairs += [(p.grad, q.grad) for p, q in zip(ours.parameters(), theirs.parameters(), strict=True)]
+    pairs += zip(ours.buffers(), theirs.buffers(), strict=True)
+    for value, right in pairs:
+        th.testing.assert_close(value, right, rtol=1e-4, atol=1e-5)
+
+    theirs.eval()
+    expected = theirs(given)
+    by_input = th.autograd.grad(expected, given, gradient)[0]
+    with th.no_grad():
+        found, kept = renormalization.evaluate(given.t())
+        of_input = renormalization.backward(kept, gradient.t().clone(), of_parameters=False, of_input=True)
+    th.testing.assert_close(found.t(), expected, rtol=1e-4, atol=1e-5)
+    th.testing.assert_close(of_input.t(), by_input, rtol=1e-4, atol=1e-5)
 
 
 def test_a_dead_unit_has_no_gradient():
     layer = BatchRenorm1d(2, warmup_steps=-1)
-    fuse_batch_renorm(layer)
     layer.ra_mean += 1
-    x = th.tensor([[0.0, 1.0], [0.0, 2.0]], requires_grad=True)
-    layer(x).square().sum().backward()
-    assert th.isfinite(x.grad).all() and x.grad[:, 1].any()
+    renormalization = Renormalization(layer)
+    with th.no_grad():
+        output, kept = renormalization.train(th.tensor([[0.0, 0.0], [1.0, 2.0]]), past_warmup=True)
+        of_input = renormalization.backward(kept, 2 * output, of_parameters=False, of_input=True)
+    assert th.isfinite(of_input).all() and of_input[1].any()
 
 
-def test_mcbs_crossq_uses_fused_batch_renormalization_unless_told_otherwise():
-    agent = agent_of(MCBSCrossQ, {"learning_starts": 5, "batch_size": 5, "search_share": 0.0})
-    for fast in (True, False, True):
-        agent.fast_update = fast
-        agent.learn(10)
-        layers = [layer for layer in agent.policy.modules() if isinstance(layer, BatchRenorm1d)]
-        assert {type(layer) for layer in layers} == {FusedBatchRenorm1d if fast else BatchRenorm1d}
-    agent.fast_update = 1
-    with pytest.raises(TypeError, match="fast_update must be True or False, got 1"):
-        agent.learn(10)
-
-
-def test_crossq_trains_as_sb3_contrib_does():
-    agents = []
-    for fused in (False, True):
-        agents.append(agent_of(CrossQ, {"learning_starts": 50}))
-        if fused:
-            fuse_batch_renorm(agents[-1].policy)
-        agents[-1].learn(80)
+@pytest.mark.parametrize("policy_delay", [1, 3])
+def test_crossq_trains_as_sb3_contrib_does(policy_delay):
+    settings = {"learning_starts": 50, "policy_delay": policy_delay, "search_share": 0.0}
+    agents = [agent_of(MCBSCrossQ, settings | {"fast_update": fast}) for fast in (False, True)]
+    assert [agent._present_update() is not None for agent in agents] == [False, True]
+    for agent in agents:
+        agent.learn(50)
+        agent.set_random_seed(1)
+        agent.train(gradient_steps=30, batch_size=32)
     for name, expected in agents[0].policy.state_dict().items():
         th.testing.assert_close(agents[1].policy.state_dict()[name], expected, rtol=1e-3, atol=1e-4)
+    for name in ("actor_loss", "critic_loss", "ent_coef", "ent_coef_loss"):
+        values = [agent.logger.name_to_value[f"train/{name}"] for agent in agents]
+        assert values[1] == pytest.approx(values[0], rel=1e-3), name
 
 
 def test_hooks_run():
@@ -214,12 +217,11 @@ def test_gradients_against_autograd():
     expected = [p.grad.clone() for p in network.parameters()]
     mlp, x = MLP(network), rows.detach().t().contiguous()
     with th.no_grad():
-        outputs = mlp.outputs(x)
-        by_input = mlp.backward(x, outputs, weight.t().contiguous(), of_parameters=False)
+        by_input = mlp.backward(mlp.run(x), weight.t().contiguous(), of_input=True)
         np.testing.assert_allclose(by_input.t(), rows.grad, rtol=1e-5, atol=1e-6)
         for parameter in network.parameters():
             parameter.grad = None
-        mlp.backward(x, mlp.outputs(x), weight.t().contiguous(), of_parameters=True)
+        mlp.backward(mlp.run(x), weight.t().contiguous(), of_parameters=True)
     for parameter, gradient in zip(network.parameters(), expected, strict=True):
         np.testing.assert_allclose(parameter.grad, gradient, rtol=1e-5, atol=1e-6)
 

@@ -11,7 +11,7 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_mcbs.agents.hyperparameters import sb3_arguments
 from sb3_mcbs.agents.mcbs import MCBS
-from sb3_mcbs.networks.soft_update import CrossQSteps
+from sb3_mcbs.networks.crossq_update import CrossQSteps
 from sb3_mcbs.types import Backend, MatmulPrecision, Preset, ScheduleName, SearchUnit, Strategy
 
 
@@ -64,7 +64,7 @@ class MCBSCrossQ(MCBS, CrossQSteps, CrossQ):
         length of its rollouts from stored states (0: none)
     :param action_noise_after_search: add ``action_noise`` to searched actions too
     :param matmul_precision: precision of the networks' float32 products (None: the process's setting)
-    :param fast_update: compute batch renormalisation with SB3-Contrib's mathematics but fewer instructions
+    :param fast_update: compute gradient steps of plain MLPs with SB3's mathematics but fewer instructions;
     :param cuda_graphs: on a GPU, capture the gradient steps of plain MLPs in CUDA graphs;
         other networks use SB3's own steps
     """

@@ -4,37 +4,17 @@ For the small networks of continuous control these cost as much as the matrix pr
 ``[features, rows]``: products in this order are faster for few rows.
 """
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
 from sb3_contrib.common.torch_layers import BatchRenorm1d
 from torch import nn
 
-from sb3_mcbs.networks.batch_renorm import FusedBatchRenorm1d
+from sb3_mcbs.networks.batch_renorm import Normalized, Renormalization
+from sb3_mcbs.networks.layers import check_parameter, gradient_of, own_state
 from sb3_mcbs.types import ACTIVATIONS
-
-
-def own_state(module: nn.Module) -> dict[str, Any]:
-    """A module's attributes, if calling the module does nothing but run its class's ``forward``.
-
-    :param module: the module.
-    :raises TypeError: if it has hooks, was compiled, or has a replaced method.
-    """
-    state = vars(module)
-    if (
-        state["_forward_hooks"]
-        or state["_forward_pre_hooks"]
-        or state["_backward_hooks"]
-        or state["_backward_pre_hooks"]
-        or "forward" in state
-        or "_call_impl" in state
-        or state.get("_compiled_call_impl") is not None
-    ):
-        raise TypeError(
-            f"a {type(module).__name__} has hooks, was compiled, or has a replaced forward method"
-        )
-    return state
 
 
 class _Linear:
@@ -56,9 +36,9 @@ class _Linear:
             raise TypeError("a Linear has other parameters than its weight and bias (it may be pruned)")
         self.weight, self.bias = parameters["weight"], parameters["bias"]
         self._column: th.Tensor | None = None
-        _check_parameter(self.weight)
+        check_parameter(self.weight)
         if self.bias is not None:
-            _check_parameter(self.bias)
+            check_parameter(self.bias)
 
     @property
     def device(self) -> th.device:
@@ -76,85 +56,35 @@ class _Linear:
             self._column = self.bias.unsqueeze(1)
         return self._column
 
+    def __call__(self, x: th.Tensor) -> th.Tensor:
+        x = th.mm(self.weight, x)
+        return x if self.bias is None else x.add_(self.column)
+
     def set_gradients(self, layer_input: th.Tensor, gradient: th.Tensor) -> None:
         """Set the parameters' ``grad``.
 
         :param layer_input: ``[in_features, rows]``.
         :param gradient: of the loss with respect to the layer's output, ``[out_features, rows]``.
         """
-        th.mm(gradient, layer_input.t(), out=_gradient_of(self.weight))
+        th.mm(gradient, layer_input.t(), out=gradient_of(self.weight))
         if self.bias is not None:
-            th.sum(gradient, 1, out=_gradient_of(self.bias))
-
-
-class _Normalization:
-    """Batch renormalization in evaluation mode, with the statistics of its first use.
-
-    :param layer: the layer.
-    :raises TypeError: if it has other parameters or statistics than SB3-Contrib gives it.
-    """
-
-    __slots__ = ("_columns", "_layer", "_tensors")
-
-    def __init__(self, layer: BatchRenorm1d) -> None:
-        state = own_state(layer)
-        parameters, statistics = state["_parameters"], state["_buffers"]
-        named = [*parameters, *statistics] == ["scale", "bias", "ra_mean", "ra_var", "steps"]
-        if not named or not layer.affine or state["_modules"]:
-            raise TypeError("a BatchRenorm1d has other parameters or statistics than SB3-Contrib's")
-        (scale, bias), (mean, variance, _) = parameters.values(), statistics.values()
-        for tensor in (scale, bias):
-            _check_parameter(tensor)
-        for tensor in (mean, variance):
-            _check_parameter(tensor, th.Tensor)
-        self._layer, self._tensors = layer, (mean, variance, scale, bias)
-        self._columns: list[th.Tensor] = []
-
-    @property
-    def device(self) -> th.device:
-        return self._tensors[0].device
-
-    @property
-    def signature(self) -> tuple[Any, ...]:
-        layer = self._layer
-        constants = type(layer), layer.eps, layer.momentum, layer.rmax, layer.dmax, layer.warmup_steps
-        return *constants, *(tensor.data_ptr() for tensor in self._tensors), layer.steps.data_ptr()  # type: ignore[operator]
-
-    @property
-    def columns(self) -> list[th.Tensor]:
-        """Mean, standard deviation, scale and bias as ``[features, 1]``."""
-        if not self._columns:
-            mean, variance, scale, bias = self._tensors
-            with th.no_grad():
-                deviation = th.add(variance, self._layer.eps).sqrt_()
-                self._columns = [each.unsqueeze(1) for each in (mean, deviation, scale, bias)]
-        return self._columns
-
-    def factors(self) -> list[th.Tensor]:
-        """One factor and one summand per feature."""
-        with th.no_grad():
-            mean, deviation, scale, bias = (column[:, 0] for column in self.columns)
-            gain = scale / deviation
-            return [gain, bias - mean * gain]
-
-    def __call__(self, x: th.Tensor) -> th.Tensor:
-        # The layer's own operations in its order: the result is equal to the bit.
-        mean, deviation, scale, bias = self.columns
-        return (x - mean).div_(deviation).mul_(scale).add_(bias)
+            th.sum(gradient, 1, out=gradient_of(self.bias))
 
 
 _ACTIVATIONS = {nn.ReLU: ACTIVATIONS["relu"], nn.Tanh: ACTIVATIONS["tanh"]}
 
 
-def _check_parameter(parameter: th.Tensor, kind: type[th.Tensor] = nn.Parameter) -> None:
-    if type(parameter) is not kind or parameter.dtype != th.float32 or not parameter.is_contiguous():
-        raise TypeError("parameters are not float32, not contiguous, or of a class of their own")
+class Pass(NamedTuple):
+    """A run of all layers, with what :meth:`MLP.backward` needs.
 
+    :param inputs: of every layer, ``[features, rows]``; of an activation, its output.
+    :param normalized: of every batch renormalization.
+    :param output: of the last layer, ``[out_features, rows]``.
+    """
 
-def _gradient_of(parameter: nn.Parameter) -> th.Tensor:
-    if parameter.grad is None:
-        parameter.grad = th.empty_like(parameter)
-    return parameter.grad
+    inputs: list[th.Tensor]
+    normalized: list[Normalized]
+    output: th.Tensor
 
 
 class MLP:
@@ -168,7 +98,7 @@ class MLP:
     """
 
     def __init__(self, *modules: nn.Module) -> None:
-        self._layers: list[_Linear | _Normalization | type[nn.Module]] = []
+        self._layers: list[_Linear | Renormalization | type[nn.Module]] = []
         self._behind_addresses: list[th.Tensor] = []
         for module in modules:
             self._append(module)
@@ -179,8 +109,8 @@ class MLP:
         if type(module) is nn.Linear:
             self._layers.append(_Linear(module))
             return
-        if isinstance(module, BatchRenorm1d) and type(module) in (BatchRenorm1d, FusedBatchRenorm1d):
-            self._layers.append(_Normalization(module))
+        if type(module) is BatchRenorm1d:
+            self._layers.append(Renormalization(module))
             return
         is_activation = type(module) in (nn.ReLU, nn.Tanh) and self._layers
         if type(module) is not nn.Sequential and not is_activation:
@@ -200,7 +130,7 @@ class MLP:
     def device(self) -> th.device:
         """The device of the first layer."""
         first = self._layers[0]
-        assert isinstance(first, _Linear | _Normalization)
+        assert isinstance(first, _Linear | Renormalization)
         return first.device
 
     @property
@@ -220,7 +150,7 @@ class MLP:
         table: list[list[int]] = []
         before = [0, 0]
         for layer in self._layers:
-            if isinstance(layer, _Normalization) and not any(before):
+            if isinstance(layer, Renormalization) and not any(before):
                 self._behind_addresses += (factors := layer.factors())
                 before = [factor.data_ptr() for factor in factors]
             elif isinstance(layer, _Linear):
@@ -230,7 +160,7 @@ class MLP:
                 n_out, n_in = layer.weight.shape
                 table.append([*before, layer.weight.data_ptr(), bias.data_ptr(), n_in, n_out, 0])
                 before = [0, 0]
-            elif not isinstance(layer, _Normalization) and not any(before) and not table[-1][-1]:
+            elif not isinstance(layer, Renormalization) and not any(before) and not table[-1][-1]:
                 table[-1][-1] = _ACTIVATIONS[layer]
             else:
                 raise TypeError("layers follow each other in an order that compiled code does not know")
@@ -246,7 +176,7 @@ class MLP:
         """
         found = []
         for layer in self._layers:
-            if isinstance(layer, _Normalization):
+            if isinstance(layer, Renormalization):
                 raise TypeError("BatchRenorm1d is trained on the statistics of batches")
             if isinstance(layer, _Linear):
                 found.append(layer.weight)
@@ -254,56 +184,67 @@ class MLP:
                     found.append(layer.bias)
         return found
 
+    @property
+    def renormalizations(self) -> list[Renormalization]:
+        """The batch renormalizations, in the order of the layers."""
+        return [layer for layer in self._layers if isinstance(layer, Renormalization)]
+
     def __call__(self, x: th.Tensor) -> th.Tensor:
-        """Run all layers.
+        """Run all layers, batch renormalization in evaluation mode with the statistics of its first call.
 
         :param x: ``[in_features, rows]`` float32.
         :return: ``[out_features, rows]``.
         """
-        return self.outputs(x)[-1]
+        for layer in self._layers:
+            x = _activate(layer, x) if isinstance(layer, type) else layer(x)
+        return x
 
-    def outputs(self, x: th.Tensor) -> list[th.Tensor]:
+    def run(self, x: th.Tensor, past_warmup: Sequence[bool] | None = None) -> Pass:
         """Run all layers and keep what :meth:`backward` needs.
 
         :param x: ``[in_features, rows]`` float32.
-        :return: the output of every layer, ``[features, rows]``. An activation overwrites its input.
+        :param past_warmup: runs batch renormalization in training mode: for each, whether its warm-up is
+            over. None: in evaluation mode, with the present statistics.
         """
-        outputs = []
+        inputs: list[th.Tensor] = []
+        kept: list[Normalized] = []
         for layer in self._layers:
-            if isinstance(layer, _Linear):
-                x = th.mm(layer.weight, x)
-                if layer.bias is not None:
-                    x += layer.column
-            elif isinstance(layer, _Normalization):
-                x = layer(x)
+            inputs.append(x)
+            if isinstance(layer, Renormalization):
+                past = None if past_warmup is None else past_warmup[len(kept)]
+                x, normalized = layer.evaluate(x) if past is None else layer.train(x, past)
+                kept.append(normalized)
             else:
-                x = x.relu_() if layer is nn.ReLU else x.tanh_()
-            outputs.append(x)
-        return outputs
+                x = _activate(layer, x) if isinstance(layer, type) else layer(x)
+        return Pass(inputs, kept, x)
 
     def backward(
-        self, x: th.Tensor, outputs: list[th.Tensor], gradient: th.Tensor, of_parameters: bool
+        self, run: Pass, gradient: th.Tensor, *, of_parameters: bool = False, of_input: bool = False
     ) -> th.Tensor:
-        """Backpropagate a gradient, either to the parameters or to the input.
+        """Backpropagate a gradient, once.
 
-        :param x: the input of :meth:`outputs`.
-        :param outputs: the result of :meth:`outputs`.
-        :param gradient: of the loss with respect to the output, ``[out_features, rows]``.
-        :param of_parameters: True sets the parameters' ``grad`` (does not add to it) and skips the gradient
-            with respect to the input; False does the opposite.
-        :return: with ``of_parameters=False`` the gradient with respect to the input, ``[in_features, rows]``.
+        :param run: the result of :meth:`run`; parts of it are overwritten.
+        :param gradient: of the loss with respect to the output, ``[out_features, rows]``; may be overwritten.
+        :param of_parameters: set the parameters' ``grad`` (does not add to it).
+        :param of_input: return the gradient with respect to the input, ``[in_features, rows]``.
         """
+        kept = [*run.normalized]
         for index in range(len(self._layers) - 1, -1, -1):
-            layer = self._layers[index]
+            layer, x = self._layers[index], run.inputs[index]
+            goes_on = of_input or index > 0
             if isinstance(layer, _Linear):
                 if of_parameters:
-                    layer.set_gradients(outputs[index - 1] if index else x, gradient)
-                if index or not of_parameters:
+                    layer.set_gradients(x, gradient)
+                if goes_on:
                     gradient = th.mm(layer.weight.t(), gradient)
+            elif isinstance(layer, Renormalization):
+                gradient = layer.backward(kept.pop(), gradient, of_parameters, goes_on)
             elif layer is nn.ReLU:
-                gradient = th.ops.aten.threshold_backward.grad_input(
-                    gradient, outputs[index], 0, grad_input=gradient
-                )
+                gradient = th.ops.aten.threshold_backward.grad_input(gradient, x, 0, grad_input=gradient)
             else:
-                gradient = th.ops.aten.tanh_backward(gradient, outputs[index])
+                gradient = th.ops.aten.tanh_backward(gradient, x)
         return gradient
+
+
+def _activate(activation: type[nn.Module], x: th.Tensor) -> th.Tensor:
+    return x.relu_() if activation is nn.ReLU else x.tanh_()

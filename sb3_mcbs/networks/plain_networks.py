@@ -23,8 +23,8 @@ from torch import nn
 from torch.nn.modules import module as torch_module
 from torch.optim import optimizer as torch_optimizer
 
-from sb3_mcbs.networks.batch_renorm import FusedBatchRenorm1d
-from sb3_mcbs.networks.mlp import MLP, own_state
+from sb3_mcbs.networks.layers import own_state
+from sb3_mcbs.networks.mlp import MLP
 
 #: Subclasses and wrappers are not included, since they may do something else.
 _STOCHASTIC_ACTORS: tuple[type[nn.Module], ...] = (SACActor, TQCActor, CrossQActor)
@@ -33,7 +33,6 @@ _NETWORKS = (TD3Actor, *_STOCHASTIC_ACTORS, *_CRITICS)
 _LAYERS = (
     nn.Linear,
     BatchRenorm1d,
-    FusedBatchRenorm1d,
     nn.ReLU,
     nn.Tanh,
     nn.Sequential,

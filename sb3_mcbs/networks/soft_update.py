@@ -1,16 +1,15 @@
-"""The gradient steps of SAC, TQC and CrossQ as functions that can be captured in CUDA graphs.
+"""The gradient steps of SAC and TQC as functions that can be captured in CUDA graphs.
 
 The mathematics, and the order in which random numbers are drawn, are SB3's. Unlike SB3's ``train`` these read
 no number back to the host, and check no distribution's parameters, for which the host would wait.
 """
 
 import math
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import Any
 
 import torch as th
-from sb3_contrib import TQC, CrossQ
+from sb3_contrib import TQC
 from sb3_contrib.common.utils import quantile_huber_loss
 from sb3_contrib.tqc import tqc as tqc_module
 from stable_baselines3 import SAC
@@ -19,8 +18,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.sac import sac as sac_module
 from torch.nn import functional as F
 
-from sb3_mcbs.networks.batch_renorm import FusedBatchRenorm1d, fuse_batch_renorm
-from sb3_mcbs.networks.gradient_steps import GradientSteps, checked_switch
+from sb3_mcbs.networks.gradient_steps import GradientSteps
 from sb3_mcbs.networks.mlp import MLP
 from sb3_mcbs.networks.plain_networks import (
     actor_mlp,
@@ -31,10 +29,7 @@ from sb3_mcbs.networks.plain_networks import (
 )
 from sb3_mcbs.networks.update import Losses, Update
 
-#: Of a gradient step of CrossQ: whether the actor is updated in it; and of the critics' layers, and of the
-#: actor's if it is updated, whether their warm-up is over.
-_Kind = tuple[bool, tuple[bool, ...], tuple[bool, ...]]
-_LOG_SQRT_TWO_PI = math.log(math.sqrt(2 * math.pi))
+LOG_SQRT_TWO_PI = math.log(math.sqrt(2 * math.pi))
 #: What the ``train`` methods call besides networks and optimizers; a user may replace it.
 _CALLED = [
     (owner, name, getattr(owner, name))
@@ -88,7 +83,7 @@ class SoftUpdate(Update):
         deviation = th.ones_like(mean) * log_std.exp()
         latent = mean + th.empty_like(mean).normal_() * deviation
         actions = th.tanh(latent)
-        density = -((latent - mean) ** 2) / (2 * deviation**2) - deviation.log() - _LOG_SQRT_TWO_PI
+        density = -((latent - mean) ** 2) / (2 * deviation**2) - deviation.log() - LOG_SQRT_TWO_PI
         squashing = th.log(1 - actions**2 + actor.action_dist.epsilon)
         return actions, (density.sum(dim=1) - squashing.sum(dim=1)).reshape(-1, 1)
 
@@ -141,6 +136,8 @@ class SACUpdate(SoftUpdate):
 
     def __init__(self, agent: SAC | TQC) -> None:
         super().__init__(agent)
+        if any(mlp.renormalizations for mlp in self._mlps):
+            raise TypeError("there is batch renormalization, which has two modes")
         self._critics = all_parameters(agent.critic)
         self._critic_targets = all_parameters(agent.critic_target)
         self._mlps += critic_mlps(agent.critic_target)
@@ -220,104 +217,6 @@ class TQCUpdate(SACUpdate):
         return quantiles.mean(dim=2).mean(dim=1, keepdim=True)
 
 
-class CrossQUpdate(SoftUpdate):
-    """The gradient steps of a CrossQ agent whose networks are MLPs with batch renormalization."""
-
-    def __init__(self, agent: CrossQ) -> None:
-        super().__init__(agent)
-        self._critic_layers = _renormalizations(agent.critic)
-        self._actor_layers = _renormalizations(agent.actor)
-
-    def next_kind(self, number: int) -> _Kind:
-        """Count the gradient step.
-
-        :return: what Python decides in it.
-        """
-        agent = self._agent
-        agent._n_updates += 1
-        with_actor = agent._n_updates % agent.policy_delay == 0
-        return (
-            with_actor,
-            tuple(map(self._count, self._critic_layers)),
-            tuple(map(self._count, self._actor_layers)) if with_actor else (),
-        )
-
-    def losses_in(self, kind: _Kind) -> tuple[str, ...]:
-        """See :meth:`Update.losses_in`."""
-        return self.losses if kind[0] else ("ent_coef", "critic_loss")
-
-    def _count(self, layer: FusedBatchRenorm1d) -> bool:
-        steps: Any = layer.steps
-        return self._counts.count(steps) > layer.warmup_steps
-
-    def step(self, data: ReplayBufferSamples, kind: _Kind) -> Losses:
-        """Update the critics, and with ``kind[0]`` the entropy coefficient and the actor."""
-        agent = self._agent
-        with_actor, critic_past, actor_past = kind
-        alpha = self._coefficient()
-        losses = {"ent_coef": alpha.reshape(())}
-        agent.actor.set_bn_training_mode(False)
-        next_actions, next_log_prob = self._sample(data.next_observations)
-        with th.enable_grad():
-            loss = self._critic_loss(data, next_actions, next_log_prob, alpha, critic_past)
-        losses["critic_loss"] = self._descend(1, loss)
-        if not with_actor:
-            return losses
-
-        with th.enable_grad(), _training_mode(agent.actor, self._actor_layers, actor_past):
-            actions, log_prob = self._sample(data.observations)
-        losses |= self._update_coefficient(log_prob)
-        with th.enable_grad():
-            values = th.cat(agent.critic(data.observations, actions), dim=1)
-            loss = (alpha * log_prob - th.min(values, dim=1, keepdim=True)[0]).mean()
-        losses["actor_loss"] = self._descend(0, loss)
-        return losses
-
-    def _critic_loss(
-        self,
-        data: ReplayBufferSamples,
-        next_actions: th.Tensor,
-        next_log_prob: th.Tensor,
-        alpha: th.Tensor,
-        past_warmup: tuple[bool, ...],
-    ) -> th.Tensor:
-        critic = self._agent.critic
-        observations = th.cat([data.observations, data.next_observations])
-        with _training_mode(critic, self._critic_layers, past_warmup):
-            both = th.cat(critic(observations, th.cat([data.actions, next_actions])), dim=1)
-        values, next_values = both.split(len(data.actions))
-        with th.no_grad():
-            next_values = th.min(next_values, dim=1, keepdim=True)[0]
-            targets = self._targets(data, next_values, next_log_prob, alpha)
-        errors = [F.mse_loss(value.unsqueeze(1), targets) for value in values.unbind(dim=1)]
-        return 0.5 * sum(errors, th.zeros_like(errors[0]))
-
-
-def _renormalizations(network: th.nn.Module) -> list[FusedBatchRenorm1d]:
-    return [layer for layer in network.modules() if isinstance(layer, FusedBatchRenorm1d)]
-
-
-@contextmanager
-def _training_mode(
-    network: Any, layers: list[FusedBatchRenorm1d], past_warmup: tuple[bool, ...]
-) -> Iterator[None]:
-    """Normalize with the statistics of the batch, and update the running ones.
-
-    :param network: the actor or critic.
-    :param layers: its batch renormalization.
-    :param past_warmup: for each, whether its warm-up is over.
-    """
-    network.set_bn_training_mode(True)
-    for layer, past in zip(layers, past_warmup, strict=True):
-        layer.past_warmup = past
-    try:
-        yield
-    finally:
-        network.set_bn_training_mode(False)
-        for layer in layers:
-            del layer.past_warmup
-
-
 class SACSteps(GradientSteps, SAC):
     """SAC, or a subclass of it, whose gradient steps on a GPU are captured in CUDA graphs."""
 
@@ -334,33 +233,3 @@ class TQCSteps(GradientSteps, TQC):
 
     def _make_update(self) -> TQCUpdate:
         return TQCUpdate(self)
-
-
-class CrossQSteps(GradientSteps, CrossQ):
-    """CrossQ with fused batch renormalization, whose gradient steps on a GPU are captured in CUDA graphs.
-
-    A subclass's constructor sets :attr:`fast_update` before the networks are set up.
-    """
-
-    #: ``False`` computes batch renormalization as SB3-Contrib does.
-    fast_update: bool
-    _sb3s_train = CrossQ.train
-
-    def _make_update(self) -> CrossQUpdate:
-        if not self.fast_update:
-            raise TypeError("fast_update is off, and SB3-Contrib's batch renormalization reads its counters")
-        return CrossQUpdate(self)
-
-    def _setup_model(self) -> None:
-        checked_switch(self, "fast_update")
-        super()._setup_model()
-
-    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        """
-        Update the networks as CrossQ does.
-
-        :param gradient_steps: how many gradient steps to do
-        :param batch_size: transitions sampled for each
-        """
-        fuse_batch_renorm(self.policy, checked_switch(self, "fast_update"))
-        super().train(gradient_steps, batch_size)

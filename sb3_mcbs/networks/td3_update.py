@@ -25,7 +25,7 @@ from sb3_mcbs.networks.plain_networks import (
     critic_mlps,
     parameters_of,
 )
-from sb3_mcbs.networks.update import Losses, Update
+from sb3_mcbs.networks.update import Losses, Update, pairs_of
 
 
 class TD3Update(Update):
@@ -70,7 +70,7 @@ class TD3Update(Update):
     def step(self, data: ReplayBufferSamples, kind: bool) -> Losses:
         """Update the critics, and with ``kind`` the actor and the targets."""
         # The training mode makes no difference to these layers, so it is not set.
-        pairs = _pairs(data.observations, data.actions)
+        pairs = pairs_of(data.observations, data.actions)
         losses = {"critic_loss": self._update_critics(data, pairs)}
         if kind:
             losses["actor_loss"] = self._update_actor(pairs)
@@ -92,7 +92,7 @@ class TD3Update(Update):
         agent = self._agent
         noise = data.actions.clone().normal_(0, agent.target_policy_noise)
         noise.clamp_(-agent.target_noise_clip, agent.target_noise_clip)
-        pairs = _pairs(data.next_observations, noise)
+        pairs = pairs_of(data.next_observations, noise)
         n_obs = len(pairs) - data.actions.shape[1]
         pairs[n_obs:] += self._actor_target(pairs[:n_obs])
         pairs[n_obs:].clamp_(-1, 1)
@@ -109,10 +109,10 @@ class TD3Update(Update):
         targets = self._targets(data)
         losses = []
         for critic in self._critics:
-            outputs = critic.outputs(pairs)
-            errors = outputs[-1] - targets
+            run = critic.run(pairs)
+            errors = run.output - targets
             losses.append(errors.square().mean())
-            critic.backward(pairs, outputs, errors * (2 / errors.numel()), of_parameters=True)
+            critic.backward(run, errors * (2 / errors.numel()), of_parameters=True)
         self.adam_step(1)
         return functools.reduce(th.add, losses)
 
@@ -124,10 +124,10 @@ class TD3Update(Update):
         """
         n_obs = len(pairs) - get_action_dim(self._agent.action_space)
         observations = pairs[:n_obs]
-        actor_outputs = self._actor.outputs(observations)
-        pairs[n_obs:] = actor_outputs[-1]
+        run = self._actor.run(observations)
+        pairs[n_obs:] = run.output
         values, gradient = self._action_gradient(pairs, n_obs)
-        self._actor.backward(observations, actor_outputs, gradient, of_parameters=True)
+        self._actor.backward(run, gradient, of_parameters=True)
         self.adam_step(0)
         return -values.mean()
 
@@ -139,10 +139,9 @@ class TD3Update(Update):
         :return: the first critic's values ``[1, batch]``, and the gradient ``[act_dim, batch]``.
         """
         critic = self._critics[0]
-        outputs = critic.outputs(pairs)
-        values = outputs[-1]
-        gradient = th.full_like(values, -1 / values.numel())
-        return values, critic.backward(pairs, outputs, gradient, of_parameters=False)[n_obs:]
+        run = critic.run(pairs)
+        gradient = th.full_like(run.output, -1 / run.output.numel())
+        return run.output, critic.backward(run, gradient, of_input=True)[n_obs:]
 
     def _update_target_networks(self) -> None:
         for targets, networks in self._targets_and_networks:
@@ -195,13 +194,3 @@ class FastUpdate(GradientSteps, TD3):
             if actions is not None:
                 return actions, state
         return super().predict(observation, state, episode_start, deterministic)
-
-
-def _pairs(observations: th.Tensor, actions: th.Tensor) -> th.Tensor:
-    """Observations above actions: float32 ``[obs_dim + act_dim, batch]``."""
-    observations = observations.flatten(1)
-    n_obs = observations.shape[1]
-    pairs = th.empty((n_obs + actions.shape[1], len(actions)), dtype=th.float32, device=actions.device)
-    pairs[:n_obs] = observations.t()
-    pairs[n_obs:] = actions.t()
-    return pairs

@@ -145,6 +145,19 @@ class Update:
         )
 
 
+def pairs_of(observations: th.Tensor, actions: th.Tensor) -> th.Tensor:
+    """Put observations above actions.
+
+    :return: float32 ``[obs_dim + act_dim, batch]``.
+    """
+    observations = observations.flatten(1)
+    n_obs = observations.shape[1]
+    pairs = th.empty((n_obs + actions.shape[1], len(actions)), dtype=th.float32, device=actions.device)
+    pairs[:n_obs] = observations.t()
+    pairs[n_obs:] = actions.t()
+    return pairs
+
+
 class HostCounts:
     """Counters on a device whose values the host knows without waiting for the device.
 

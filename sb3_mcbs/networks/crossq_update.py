@@ -1,0 +1,207 @@
+"""CrossQ's gradient step with SB3-Contrib's mathematics and fewer instructions.
+
+The gradients are written out, as in :mod:`~sb3_mcbs.networks.td3_update`: without autograd's graph, without
+the gradients that are not needed (of the critics' weights in the actor's step), and with all tensors of Adam
+in one call. Random numbers are drawn in the same order, so both give the same networks up to float32
+rounding.
+"""
+
+import functools
+from typing import Any, NamedTuple
+
+import torch as th
+from sb3_contrib import CrossQ
+from sb3_contrib.crossq.policies import LOG_STD_MAX, LOG_STD_MIN
+from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+
+from sb3_mcbs.networks.gradient_steps import GradientSteps, checked_switch
+from sb3_mcbs.networks.mlp import MLP, Pass
+from sb3_mcbs.networks.soft_update import LOG_SQRT_TWO_PI, SoftUpdate
+from sb3_mcbs.networks.update import Losses, pairs_of
+
+
+class _Kind(NamedTuple):
+    """What Python decides in a gradient step: which layers' warm-up is over, and more.
+
+    :param with_actor: whether the actor is updated.
+    :param critics: for each critic and each of its batch renormalizations.
+    :param actor: for each of the actor's, if it is updated.
+    """
+
+    with_actor: bool
+    critics: tuple[tuple[bool, ...], ...]
+    actor: tuple[bool, ...]
+
+
+class _Sampled(NamedTuple):
+    """Actions drawn from the actor, with what its gradient needs.
+
+    :param actions: ``[act_dim, rows]``, in [-1, 1].
+    :param log_prob: ``[1, rows]``, the logarithms of their density.
+    :param noise: ``[act_dim, rows]``, standard normal.
+    :param log_std: ``[act_dim, rows]``, clipped.
+    :param latent: the run of the layers below.
+    :param mean: the run of the layer of the means.
+    :param unclipped: the run of the layer of the standard deviations' logarithms.
+    """
+
+    actions: th.Tensor
+    log_prob: th.Tensor
+    noise: th.Tensor
+    log_std: th.Tensor
+    latent: Pass
+    mean: Pass
+    unclipped: Pass
+
+
+class CrossQUpdate(SoftUpdate):
+    """The gradient steps of a CrossQ agent whose networks are MLPs with batch renormalization.
+
+    :param agent: the agent; see :class:`~sb3_mcbs.networks.update.Update`.
+    :raises TypeError: if something about a network or optimizer is not covered; use SB3-Contrib's ``train``
+        then.
+    """
+
+    def __init__(self, agent: CrossQ) -> None:
+        super().__init__(agent)
+        _, self._log_std, *self._critics = self._mlps
+        self._latent, self._mean = MLP(agent.actor.latent_pi), MLP(agent.actor.mu)
+
+    def next_kind(self, number: int) -> _Kind:
+        """Count the gradient step.
+
+        :return: what Python decides in it.
+        """
+        agent = self._agent
+        agent._n_updates += 1
+        with_actor = agent._n_updates % agent.policy_delay == 0
+        critics = tuple(map(self._past_warmup, self._critics))
+        return _Kind(with_actor, critics, self._past_warmup(self._latent) if with_actor else ())
+
+    def _past_warmup(self, mlp: MLP) -> tuple[bool, ...]:
+        layers: list[Any] = [renormalization.layer for renormalization in mlp.renormalizations]
+        return tuple(self._counts.count(layer.steps) > layer.warmup_steps for layer in layers)
+
+    def losses_in(self, kind: _Kind) -> tuple[str, ...]:
+        """See :meth:`Update.losses_in`."""
+        return self.losses if kind.with_actor else ("ent_coef", "critic_loss")
+
+    def step(self, data: ReplayBufferSamples, kind: _Kind) -> Losses:
+        """Update the critics, and with ``kind.with_actor`` the entropy coefficient and the actor."""
+        alpha = self._coefficient()
+        pairs = pairs_of(data.observations, data.actions)
+        losses = {"ent_coef": alpha.reshape(())}
+        losses["critic_loss"] = self._update_critics(data, pairs, alpha, kind.critics)
+        if kind.with_actor:
+            n_obs = len(pairs) - get_action_dim(self._agent.action_space)
+            sampled = self._draw(pairs[:n_obs], kind.actor)
+            losses |= self._update_coefficient(sampled.log_prob)
+            pairs[n_obs:] = sampled.actions
+            losses["actor_loss"] = self._update_actor(pairs, sampled, alpha)
+        return losses
+
+    def _draw(self, observations: th.Tensor, past_warmup: tuple[bool, ...] | None = None) -> _Sampled:
+        """Draw actions.
+
+        :param observations: ``[obs_dim, rows]``.
+        :param past_warmup: see :meth:`MLP.run`.
+        """
+        latent = self._latent.run(observations, past_warmup)
+        mean, unclipped = self._mean.run(latent.output), self._log_std.run(latent.output)
+        log_std = unclipped.output.clamp(LOG_STD_MIN, LOG_STD_MAX)
+        noise = th.empty_like(log_std.t(), memory_format=th.contiguous_format).normal_().t()
+        actions = (mean.output + noise * log_std.exp()).tanh_()
+        density = noise.square().mul_(-0.5).sub_(log_std).sub_(LOG_SQRT_TWO_PI)
+        density -= self._squashing(actions).log_()
+        return _Sampled(actions, density.sum(0, keepdim=True), noise, log_std, latent, mean, unclipped)
+
+    def _squashing(self, actions: th.Tensor) -> th.Tensor:
+        """The derivatives of actions with respect to what the tanh squashes, never 0."""
+        return 1 - actions.square() + self._agent.actor.action_dist.epsilon
+
+    def _update_critics(
+        self,
+        data: ReplayBufferSamples,
+        pairs: th.Tensor,
+        alpha: th.Tensor,
+        past_warmup: tuple[tuple[bool, ...], ...],
+    ) -> th.Tensor:
+        """One step of all critics, with the values of both ends of the transitions from one run.
+
+        :param pairs: ``[obs_dim + act_dim, batch]``.
+        :param alpha: the entropy coefficient.
+        :param past_warmup: for each critic.
+        :return: the loss: half the sum of their mean squared errors.
+        """
+        n = len(data.actions)
+        next_pairs = pairs_of(data.next_observations, data.actions)
+        n_obs = len(pairs) - get_action_dim(self._agent.action_space)
+        sampled = self._draw(next_pairs[:n_obs])
+        next_pairs[n_obs:] = sampled.actions
+        both = th.cat([pairs, next_pairs], dim=1)
+        runs = [critic.run(both, past) for critic, past in zip(self._critics, past_warmup, strict=True)]
+        next_values = th.cat([run.output[:, n:] for run in runs]).amin(dim=0).unsqueeze(1)
+        targets = self._targets(data, next_values, sampled.log_prob.t(), alpha).t()
+        losses = []
+        for critic, run in zip(self._critics, runs, strict=True):
+            errors = run.output[:, :n] - targets
+            losses.append(0.5 * errors.square().mean())
+            gradient = th.zeros_like(run.output)
+            gradient[:, :n] = errors / n
+            critic.backward(run, gradient, of_parameters=True)
+        self.adam_step(1)
+        return functools.reduce(th.add, losses)
+
+    def _update_actor(self, pairs: th.Tensor, sampled: _Sampled, alpha: th.Tensor) -> th.Tensor:
+        """One step of the actor up the lowest critic.
+
+        :param pairs: ``[obs_dim + act_dim, batch]``, with the actor's actions.
+        :param sampled: these actions.
+        :param alpha: the entropy coefficient.
+        :return: the loss: the mean of the weighted logarithms of their density less their values.
+        """
+        n = pairs.shape[1]
+        values, by_action = self._action_gradient(pairs)
+        actions, _, noise, log_std, latent, mean, unclipped = sampled
+        by_action += (2 * alpha / n) * actions / self._squashing(actions)
+        by_mean = by_action.mul_(1 - actions.square())
+        by_log_std = by_mean * noise * log_std.exp() - alpha / n
+        by_log_std *= unclipped.output == log_std
+        by_latent = self._mean.backward(mean, by_mean, of_parameters=True, of_input=True)
+        by_latent += self._log_std.backward(unclipped, by_log_std, of_parameters=True, of_input=True)
+        self._latent.backward(latent, by_latent, of_parameters=True)
+        self.adam_step(0)
+        return (alpha * sampled.log_prob - values).mean()
+
+    def _action_gradient(self, pairs: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """The gradient of the negative mean of the lowest critic's values.
+
+        :param pairs: ``[obs_dim + act_dim, batch]``.
+        :return: these values ``[batch]``, and the gradient with respect to the actions ``[act_dim, batch]``.
+        """
+        runs = [critic.run(pairs) for critic in self._critics]
+        values, lowest = th.cat([run.output for run in runs]).min(dim=0)
+        gradients = []
+        for number, (critic, run) in enumerate(zip(self._critics, runs, strict=True)):
+            gradient = th.where(lowest == number, -1 / len(values), 0.0).unsqueeze(0)
+            gradients.append(critic.backward(run, gradient, of_input=True))
+        n_actions = get_action_dim(self._agent.action_space)
+        return values, functools.reduce(th.add, gradients)[-n_actions:]
+
+
+class CrossQSteps(GradientSteps, CrossQ):
+    """CrossQ, or a subclass of it, whose gradient steps are those of :class:`CrossQUpdate` where they can be.
+
+    A subclass's constructor sets :attr:`fast_update` before the networks are set up.
+    """
+
+    #: ``False`` leaves gradient steps to SB3-Contrib.
+    fast_update: bool
+    _sb3s_train = CrossQ.train
+
+    def _wants_update(self) -> bool:
+        return checked_switch(self, "fast_update")
+
+    def _make_update(self) -> CrossQUpdate:
+        return CrossQUpdate(self)
