@@ -1,5 +1,6 @@
 """The command ``sb3-mcbs``."""
 
+import os
 import sys
 
 from sb3_mcbs import __version__
@@ -37,6 +38,9 @@ def main() -> None:
     sys.argv = [f"sb3-mcbs {name}", *sys.argv[2:]]
     try:
         import_with_zoo(COMMANDS[name][0]).main()
+    except BrokenPipeError:  # the reader of the output, as head, wants no more
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
     except MissingZooError as error:
         sys.exit(f"sb3-mcbs {name}: {error}")
 
