@@ -11,13 +11,14 @@ from typing import Any, NamedTuple
 
 import torch as th
 from sb3_contrib import CrossQ
-from sb3_contrib.crossq.policies import LOG_STD_MAX, LOG_STD_MIN
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_mcbs.networks.gradient_steps import GradientSteps, checked_switch
-from sb3_mcbs.networks.mlp import MLP, Pass
-from sb3_mcbs.networks.soft_update import LOG_SQRT_TWO_PI, SoftUpdate
+from sb3_mcbs.networks.mlp import MLP
+from sb3_mcbs.networks.plain_networks import critic_mlps
+from sb3_mcbs.networks.soft_update import SoftUpdate
+from sb3_mcbs.networks.squashed_gaussian import Sampled, SquashedGaussian
 from sb3_mcbs.networks.update import Losses, pairs_of
 
 
@@ -34,27 +35,6 @@ class _Kind(NamedTuple):
     actor: tuple[bool, ...]
 
 
-class _Sampled(NamedTuple):
-    """Actions drawn from the actor, with what its gradient needs.
-
-    :param actions: ``[act_dim, rows]``, in [-1, 1].
-    :param log_prob: ``[1, rows]``, the logarithms of their density.
-    :param noise: ``[act_dim, rows]``, standard normal.
-    :param log_std: ``[act_dim, rows]``, clipped.
-    :param latent: the run of the layers below.
-    :param mean: the run of the layer of the means.
-    :param unclipped: the run of the layer of the standard deviations' logarithms.
-    """
-
-    actions: th.Tensor
-    log_prob: th.Tensor
-    noise: th.Tensor
-    log_std: th.Tensor
-    latent: Pass
-    mean: Pass
-    unclipped: Pass
-
-
 class CrossQUpdate(SoftUpdate):
     """The gradient steps of a CrossQ agent whose networks are MLPs with batch renormalization.
 
@@ -65,8 +45,8 @@ class CrossQUpdate(SoftUpdate):
 
     def __init__(self, agent: CrossQ) -> None:
         super().__init__(agent)
-        _, self._log_std, *self._critics = self._mlps
-        self._latent, self._mean = MLP(agent.actor.latent_pi), MLP(agent.actor.mu)
+        self._critics = critic_mlps(agent.critic)
+        self._gaussian = SquashedGaussian(agent.actor)
 
     def next_kind(self, number: int) -> _Kind:
         """Count the gradient step.
@@ -77,7 +57,7 @@ class CrossQUpdate(SoftUpdate):
         agent._n_updates += 1
         with_actor = agent._n_updates % agent.policy_delay == 0
         critics = tuple(map(self._past_warmup, self._critics))
-        return _Kind(with_actor, critics, self._past_warmup(self._latent) if with_actor else ())
+        return _Kind(with_actor, critics, self._past_warmup(self._gaussian.latent) if with_actor else ())
 
     def _past_warmup(self, mlp: MLP) -> tuple[bool, ...]:
         layers: list[Any] = [renormalization.layer for renormalization in mlp.renormalizations]
@@ -101,24 +81,15 @@ class CrossQUpdate(SoftUpdate):
             losses["actor_loss"] = self._update_actor(pairs, sampled, alpha)
         return losses
 
-    def _draw(self, observations: th.Tensor, past_warmup: tuple[bool, ...] | None = None) -> _Sampled:
+    def _draw(self, observations: th.Tensor, past_warmup: tuple[bool, ...] | None = None) -> Sampled:
         """Draw actions.
 
         :param observations: ``[obs_dim, rows]``.
-        :param past_warmup: see :meth:`MLP.run`.
+        :param past_warmup: see :meth:`~sb3_mcbs.networks.mlp.MLP.run`.
         """
-        latent = self._latent.run(observations, past_warmup)
-        mean, unclipped = self._mean.run(latent.output), self._log_std.run(latent.output)
-        log_std = unclipped.output.clamp(LOG_STD_MIN, LOG_STD_MAX)
-        noise = th.empty_like(log_std.t(), memory_format=th.contiguous_format).normal_().t()
-        actions = (mean.output + noise * log_std.exp()).tanh_()
-        density = noise.square().mul_(-0.5).sub_(log_std).sub_(LOG_SQRT_TWO_PI)
-        density -= self._squashing(actions).log_()
-        return _Sampled(actions, density.sum(0, keepdim=True), noise, log_std, latent, mean, unclipped)
-
-    def _squashing(self, actions: th.Tensor) -> th.Tensor:
-        """The derivatives of actions with respect to what the tanh squashes, never 0."""
-        return 1 - actions.square() + self._agent.actor.action_dist.epsilon
+        shape = observations.shape[1], self._gaussian.act_dim
+        noise = th.empty(shape, device=observations.device).normal_().t()
+        return self._gaussian.sample(observations, noise, past_warmup)
 
     def _update_critics(
         self,
@@ -153,7 +124,7 @@ class CrossQUpdate(SoftUpdate):
         self.adam_step(1)
         return functools.reduce(th.add, losses)
 
-    def _update_actor(self, pairs: th.Tensor, sampled: _Sampled, alpha: th.Tensor) -> th.Tensor:
+    def _update_actor(self, pairs: th.Tensor, sampled: Sampled, alpha: th.Tensor) -> th.Tensor:
         """One step of the actor up the lowest critic.
 
         :param pairs: ``[obs_dim + act_dim, batch]``, with the actor's actions.
@@ -161,16 +132,8 @@ class CrossQUpdate(SoftUpdate):
         :param alpha: the entropy coefficient.
         :return: the loss: the mean of the weighted logarithms of their density less their values.
         """
-        n = pairs.shape[1]
         values, by_action = self._action_gradient(pairs)
-        actions, _, noise, log_std, latent, mean, unclipped = sampled
-        by_action += (2 * alpha / n) * actions / self._squashing(actions)
-        by_mean = by_action.mul_(1 - actions.square())
-        by_log_std = by_mean * noise * log_std.exp() - alpha / n
-        by_log_std *= unclipped.output == log_std
-        by_latent = self._mean.backward(mean, by_mean, of_parameters=True, of_input=True)
-        by_latent += self._log_std.backward(unclipped, by_log_std, of_parameters=True, of_input=True)
-        self._latent.backward(latent, by_latent, of_parameters=True)
+        self._gaussian.backward(sampled, by_action, alpha / pairs.shape[1])
         self.adam_step(0)
         return (alpha * sampled.log_prob - values).mean()
 

@@ -4,7 +4,6 @@ The mathematics, and the order in which random numbers are drawn, are SB3's. Unl
 no number back to the host, and check no distribution's parameters, for which the host would wait.
 """
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -27,9 +26,9 @@ from sb3_mcbs.networks.plain_networks import (
     check_unreplaced,
     critic_mlps,
 )
+from sb3_mcbs.networks.squashed_gaussian import LOG_SQRT_TWO_PI
 from sb3_mcbs.networks.update import Losses, Update
 
-LOG_SQRT_TWO_PI = math.log(math.sqrt(2 * math.pi))
 #: What the ``train`` methods call besides networks and optimizers; a user may replace it.
 _CALLED = [
     (owner, name, getattr(owner, name))
