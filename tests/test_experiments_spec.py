@@ -121,8 +121,9 @@ SHIPPED = {
     "evidence": 45,
     "ablation": 18,
     "ablation-frozen": 66,
-    "search-training": 55,
+    "search-training": 60,
     "crossq": 35,
+    "crossq-100k": 40,
     "saturation": 20,
     "learned-model": 6,
 }
