@@ -124,6 +124,7 @@ SHIPPED = {
     "search-training": 60,
     "crossq": 35,
     "crossq-100k": 40,
+    "crossq-copies": 2,
     "saturation": 20,
     "learned-model": 6,
 }
