@@ -22,10 +22,8 @@ model = algorithm(
     args.env,
     learning_starts=args.learning_starts,
     policy_kwargs=dict(net_arch=args.net_arch),
-    preset="efficient",  # 18 simulated steps per decision
-    search_share=0.5,  # search in half of the episodes ...
-    search_unit="episode",
-    value_expansion=2,  # ... and roll critic targets two steps forward
+    preset="train",  # search in half of the episodes, and learn from simulated transitions
+    policy_delay={"td3": 2, "crossq": 1}[args.algo],
     seed=0,
     verbose=1,
 )

@@ -17,7 +17,7 @@ Observations = np.ndarray | dict[str, np.ndarray]
 
 # Names of choices, for type checkers. What a command or an error lists comes from the same place.
 Strategy = Literal["beam", "tree", "cem"]
-Preset = Literal["paper", "efficient", "balanced", "strong"]
+Preset = Literal["paper", "efficient", "balanced", "strong", "train"]
 Backend = Literal["auto", "mujoco", "pool", "ensemble"]
 ScheduleName = Literal["constant", "saturation", "anneal"]
 SearchUnit = Literal["step", "episode"]

@@ -9,15 +9,13 @@ import pytest
 from sb3_mcbs import MCBS, MCBSSAC, MCBSCrossQ
 from sb3_mcbs.agents import EnsembleSettings, ScheduleSettings
 from sb3_mcbs.agents.hyperparameters import SETTINGS
+from sb3_mcbs.agents.presets import OF_PRESETS
 from sb3_mcbs.agents.value_expansion import ValueExpansionSettings
 from sb3_mcbs.networks.td3_update import FastUpdate
 from sb3_mcbs.search import PRESETS
 from sb3_mcbs.search.settings import STRATEGIES
 from sb3_mcbs.types import Preset, Strategy
 from tests.conftest import SEARCHING, SMALL_SEARCH, WITHOUT_SEARCH
-
-#: What a preset may say: ``None`` in signatures.
-OF_PRESETS = {"beam_width", "rollout_depth", "n_simulations", "beam_noise", "strategy"}
 
 
 def keywords(cls) -> list[str]:

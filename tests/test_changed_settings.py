@@ -15,6 +15,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_mcbs import MCBSSAC, MCBSTD3, MCBSTQC, SearchPolicy
 from sb3_mcbs.agents.hyperparameters import SETTINGS
 from sb3_mcbs.agents.schedule import ScheduleSettings
+from sb3_mcbs.models import ForwardModelError
 from sb3_mcbs.search import PRESETS, CEMSettings, SearchSettings, TreeSettings
 from tests.checkpoint_helpers import assert_resumed_is_exact
 from tests.conftest import SEARCHING, SMALL, SMALL_SEARCH, assert_same_parameters, snapshot_vec_env
@@ -146,7 +147,7 @@ def test_wrong_values_are_refused_at_once_and_change_nothing(make_agent, cls):
         ("schedule_kwargs", {"window": 5}, TypeError, "search_schedule='constant' has no 'window'"),
         ("action_noise_after_search", "yes", TypeError, "action_noise_after_search"),
         ("preset", "quick", ValueError, "There is no preset 'quick'"),
-        ("value_expansion", 2, ValueError, "not from or to 0"),
+        ("value_expansion", 2, ForwardModelError, "needs batched MuJoCo"),
         ("forward_model", "ensemble", ValueError, "decided when it is made or loaded"),
         ("forward_model", "mujoco", Exception, "environment 0"),
         ("model_kwargs", {"ensemble_size": 3}, TypeError, "ensemble_size is for forward_model='ensemble'"),
@@ -159,13 +160,38 @@ def test_wrong_values_are_refused_at_once_and_change_nothing(make_agent, cls):
     assert_same_training(trained(agent), untouched)
 
 
-def test_what_is_kept_beside_the_replay_buffer_stays_as_it_is(make_agent):
-    agent = make_agent("InvertedPendulum-v5", value_expansion=1, expanded_share=0.5)
-    with pytest.raises(ValueError, match="not from or to 0"):
-        agent.value_expansion = 0
+@pytest.mark.parametrize("before", [0, 1])
+def test_value_expansion_is_changed_and_switched_on(make_agent, before):
+    agent = make_agent("InvertedPendulum-v5", value_expansion=before, expanded_share=0.5)
     agent.value_expansion, agent.expanded_share = 2, 0.25
     made = make_agent("InvertedPendulum-v5", value_expansion=2, expanded_share=0.25)
     assert_same_training(trained(agent), trained(made))
+
+
+@pytest.mark.parametrize("branch_length", [0, 4])
+def test_value_expansion_is_switched_off_and_on_while_training(make_agent, branch_length):
+    agent = make_agent("InvertedPendulum-v5", search_share=0.0)
+    simulated = {}
+
+    class Notes(BaseCallback):
+        def _on_step(self) -> bool:
+            if self.n_calls in (30, 60):
+                self.model.value_expansion = 2
+                self.model.branch_length = branch_length
+            if self.n_calls == 45:
+                self.model.branch_length = 0
+                self.model.value_expansion = 0
+            simulated[self.n_calls] = self.model.n_simulated_steps
+            return True
+
+    agent.learn(80, callback=Notes())
+    assert simulated[30] == 0 < simulated[46] == simulated[60] < simulated[80]
+    held = agent.replay_buffer.expansion_held[:80, 0]
+    assert not held[:29].any() and not held[45:59].any() and held[31:44].any() and held[61:80].any()
+    agent.branch_length = agent.value_expansion = 0
+    assert agent.branches is None
+    agent.learn(20, reset_num_timesteps=False)
+    assert not hasattr(agent.replay_buffer, "expansion_held")
 
 
 def test_all_settings_change_at_once(make_agent):
@@ -193,6 +219,7 @@ def test_a_preset_can_be_set_later_and_when_loading(tmp_path, preset):
     for each in (agent, loaded):
         assert (each.preset, each.search_settings) == (preset, expected)
         assert each.search_share == (1.0 if preset == "paper" else 0.5)  # Algorithm 1 is at every step
+        assert each.search_unit == ("episode" if preset == "train" else "step")
     changed = MCBSTD3.load(tmp_path / "agent", device="cpu", preset=preset, beam_width=9)
     assert changed.search_settings == replace(expected, beam_width=9)
     without = MCBSTD3.load(tmp_path / "agent", device="cpu", preset=None)
@@ -225,11 +252,12 @@ def test_where_the_schedule_starts_to_leave_the_search_out_the_actor_explores(ma
         dict(strategy="cem"),
         dict(search_kwargs=dict(antithetic=True)),
         dict(search_share=0.3),
+        dict(value_expansion=2, branch_length=4),
     ],
 )
 def test_a_resumed_run_goes_on_with_the_changed_settings(tmp_path, changes):
     def make(folder):
-        env = snapshot_vec_env("Pendulum-v1")
+        env = snapshot_vec_env("InvertedPendulum-v5")
         return MCBSTD3("MlpPolicy", env, seed=0, learning_starts=20, **SMALL, **SMALL_SEARCH)
 
     def more(folder):

@@ -148,8 +148,9 @@ def test_presets():
     changed = SearchSettings.preset("balanced", rollout_depth=2, search_kwargs=dict(n_rounds=4))
     assert changed == CEMSettings(12, 2, 1, antithetic=True, n_rounds=4)
     assert SearchSettings.preset("strong", strategy="tree").antithetic, "and what a tree does not know is not"
+    assert SearchSettings.preset("train") == SearchSettings.preset("efficient")
     for unknown in ("best", None, ["strong"]):
-        with pytest.raises(ValueError, match="known are paper, efficient, balanced, strong"):
+        with pytest.raises(ValueError, match="known are paper, efficient, balanced, strong, train"):
             SearchSettings.preset(unknown)
 
 

@@ -51,7 +51,7 @@ def test_bad_settings_are_refused_at_construction(make_agent, cls):
         make_agent(cls=cls, rollout_depth=-1)
     for name in ("search_share", "value_expansion", "action_noise_after_search"):
         with pytest.raises(TypeError, match=f"{name} must be"):
-            make_agent(cls=cls, **{name: None})
+            make_agent(cls=cls, **{name: "much"})
     with pytest.raises(TypeError, match="action_noise_after_search"):
         make_agent(cls=cls, action_noise_after_search="yes")
     with pytest.raises(TypeError, match=rf"{cls.__name__}.* unexpected keyword argument 'beam'"):

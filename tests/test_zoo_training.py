@@ -13,6 +13,7 @@ from stable_baselines3.common.logger import Logger
 from sb3_mcbs import MCBSTD3, SearchPolicy, SearchSettings, SnapshotEnvWrapper
 from sb3_mcbs.agents.hyperparameters import SETTINGS
 from sb3_mcbs.agents.registry import SEARCHING as ALGORITHMS
+from sb3_mcbs.models import ForwardModelError
 from sb3_mcbs.zoo.callbacks import RenamingLogger, SearchEvalCallback, SecondEvalCallback
 from sb3_mcbs.zoo.manager import NAMES
 from sb3_mcbs.zoo.paths import sibling_folder
@@ -215,8 +216,8 @@ def test_names_need_no_quotes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 @pytest.mark.parametrize(
     ("word", "line"),
     [
-        ("preset:strng", "there is no such preset; known are paper, efficient, balanced, strong."),
-        ("preset:'strng'", "there is no such preset; known are paper, efficient, balanced, strong."),
+        ("preset:strng", "there is no such preset; known are paper, efficient, balanced, strong, train."),
+        ("preset:'strng'", "there is no such preset; known are paper, efficient, balanced, strong, train."),
         ("search_unit:episodes", "there is no such search_unit; known are step, episode."),
         ("search_share:true", "must be a number, True, False or None."),
         ("search_kwargs:antithetic", "must be a dictionary, such as dict(NAME=VALUE), or None."),
@@ -245,6 +246,16 @@ def test_every_setting_that_is_a_name_is_known() -> None:
 def test_no_file_of_this_package_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(SystemExit, match=r"-conf sb3_mcbs: .* no hyperparameters for 'ppo'"):
         zoo_train(monkeypatch, tmp_path, "ppo", "-n", "101", "-conf", "sb3_mcbs")
+
+
+def test_the_preset_for_training_where_no_states_can_be_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    words = ("-n", "101", "--eval-freq", "-1", "-params", *TINY, "preset:train")
+    zoo_train(monkeypatch, tmp_path, "mcbs_td3", *words)
+    assert "value expansion is left out: it needs batched MuJoCo" in capsys.readouterr().out
+    with pytest.raises(ForwardModelError, match="Leave value_expansion out"):
+        zoo_train(monkeypatch, tmp_path, "mcbs_td3", *words, "value_expansion:2")
 
 
 @pytest.mark.parametrize("algo", ALGORITHMS)
@@ -282,7 +293,7 @@ def test_the_papers_preset_takes_noise_from_searched_actions(
         assert (agent.action_noise_after_search, agent.search_share) == (noisy, 0.5 if noisy else 1)
 
 
-@pytest.mark.parametrize("preset", ["paper", "strong"])
+@pytest.mark.parametrize("preset", ["paper", "strong", "train"])
 def test_a_preset_replaces_what_the_file_says_of_the_search(
     preset: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -300,8 +311,10 @@ def test_a_preset_replaces_what_the_file_says_of_the_search(
     folder = tmp_path / "logs" / "mcbs_td3" / "HalfCheetah-v5_1"
     agent = MCBSTD3.load(folder / "HalfCheetah-v5.zip")
     assert agent.search_settings == SearchSettings.preset(preset, model_kwargs=dict(n_threads=1))
-    is_algorithm_1 = (agent.search_share, agent.search_unit, agent.value_expansion) == (1, "step", 0)
-    assert is_algorithm_1 == (preset == "paper"), "the others leave it to the file when to search"
+    training = agent.search_share, agent.search_unit, agent.value_expansion, agent.branch_length
+    of_file = 0.5, "episode", 2, 0
+    of_presets = {"paper": (1, "step", 0, 0), "train": (0.5, "episode", 2, 20)}
+    assert training == of_presets.get(preset, of_file), "the others leave it to the file when to search"
 
 
 def test_several_environments_in_this_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

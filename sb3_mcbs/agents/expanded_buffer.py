@@ -73,7 +73,8 @@ class ExpandedReplayBuffer(ReplayBuffer):
         :return: n-step transitions. Those that ended an episode are not expanded.
         """
         agent = self.expanding_agent
-        n_expanded = round(agent.expanded_share * batch_size)
+        # After a callback has switched value expansion off, no sample is expanded.
+        n_expanded = round(agent.expanded_share * batch_size) if agent.value_expansion else 0
         branches: Branches | None = agent.go_on_with_branches(env) if n_expanded else None
         if branches is not None and not len(branches):
             n_expanded = 0  # no stored state to branch off
@@ -263,6 +264,18 @@ def batched_states(agent: Any) -> np.ndarray:
             f"MuJoCo; the forward model is: {planner.description}. Leave value_expansion out."
         )
     return np.stack(states)
+
+
+def has_batched_states(agent: Any) -> bool:
+    """Whether an agent's forward model simulates from states that are arrays.
+
+    :param agent: an :class:`~sb3_mcbs.MCBS` agent.
+    """
+    try:
+        batched_states(agent)
+    except ForwardModelError:
+        return False
+    return True
 
 
 def _is_batched(model: Any) -> bool:

@@ -10,11 +10,12 @@ from dataclasses import fields
 from typing import Any, Self
 
 from sb3_mcbs.agents.learned_model import EnsembleSettings
+from sb3_mcbs.agents.presets import OF_PRESETS, TRAINING, decide_expansion, settings_of_preset
 from sb3_mcbs.agents.schedule import ScheduleSettings
-from sb3_mcbs.agents.value_expansion import ValueExpansionSettings
-from sb3_mcbs.search import BeamSettings, SearchSettings, make_settings, with_preset
+from sb3_mcbs.agents.value_expansion import EXPANSION
+from sb3_mcbs.search import BeamSettings, SearchSettings, with_preset
 from sb3_mcbs.search.checks import as_dict
-from sb3_mcbs.search.settings import OF_THE_MACHINE, STRATEGIES, present_name
+from sb3_mcbs.search.settings import STRATEGIES, present_name
 from sb3_mcbs.types import Backend, MatmulPrecision, Preset, ScheduleName, SearchUnit, Strategy
 
 #: An agent's constructor parameters besides SB3's, and their defaults without a preset. The agent has them as
@@ -40,8 +41,6 @@ SETTINGS: dict[str, Any] = {
     "matmul_precision": None,
 }
 GROUPS = ("search_kwargs", "schedule_kwargs", "model_kwargs")
-#: Settings of presets: their default in the constructors is ``None``, which means not given.
-OF_PRESETS = ("beam_width", "rollout_depth", "n_simulations", "beam_noise", "strategy")
 
 #: Removed settings: their former default, and the reason or replacement.
 REMOVED: dict[str, tuple[Any, str]] = {
@@ -106,7 +105,7 @@ def complete_settings(arguments: Mapping[str, Any]) -> dict[str, Any]:
     """Complete the settings of an agent.
 
     :param arguments: of its constructor, including SB3's.
-    :return: the value of each of :data:`SETTINGS`.
+    :return: the value of each of :data:`SETTINGS`, and what :func:`decide_expansion` adds.
     :raises TypeError: if a dictionary of settings is not a dictionary.
     :raises ValueError: if there is no such preset.
     """
@@ -114,7 +113,9 @@ def complete_settings(arguments: Mapping[str, Any]) -> dict[str, Any]:
     for name in OF_PRESETS:
         if given.get(name) is None:
             given.pop(name, None)
-    return tidied({**SETTINGS, **with_preset(given.get("preset"), given)})
+    combined = with_preset(given.get("preset"), given)
+    of_training = TRAINING.get(given.get("preset", ""), {})
+    return tidied({**SETTINGS, **of_training, **combined, **decide_expansion(given)})
 
 
 def tidied(settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -199,24 +200,6 @@ def group_flat(attributes: dict[str, Any]) -> None:
             attributes[group] = values
 
 
-def settings_of_preset(name: Preset) -> dict[str, Any]:
-    """The settings that a preset replaces in an existing agent or a hyperparameter file.
-
-    :param name: one of :data:`~sb3_mcbs.search.PRESETS`.
-    :return: all settings of the search; for ``"paper"``, Algorithm 1 at every step, also the schedule, value
-        expansion and ``action_noise_after_search``.
-    :raises ValueError: if there is no such preset.
-    """
-    settings = make_settings(**with_preset(name, {})).grouped()
-    for setting in OF_THE_MACHINE:
-        del settings[setting]
-    if name == "paper":
-        for defaults in (ScheduleSettings(), ValueExpansionSettings()):
-            settings |= defaults.grouped()
-        settings["action_noise_after_search"] = False
-    return settings
-
-
 @contextmanager
 def moved_modules() -> Iterator[None]:
     """Let agents be unpickled that were saved before their modules were moved."""
@@ -275,7 +258,10 @@ class SearchAttributes(RefusesOldNames):
             super().__setattr__(name, value)
             self._follow_settings()
         elif name == "preset" and value is not None:
-            self._change_settings({**settings_of_preset(value), name: value})
+            changes = {**settings_of_preset(value), name: value}
+            self._change_settings({**changes, **decide_expansion(changes)})
+        elif name in EXPANSION:
+            self._change_settings({name: value, "expansion_where_possible": None})
         else:
             self._change_settings({name: value})
 

@@ -19,14 +19,12 @@ from sb3_mcbs.agents.faults import environment_named
 from sb3_mcbs.agents.hyperparameters import (
     GROUPS,
     MOVED,
-    OF_PRESETS,
     SETTINGS,
     SearchAttributes,
     complete_settings,
     convert_older,
     moved_modules,
     refuse_old_names,
-    settings_of_preset,
     tidied,
 )
 from sb3_mcbs.agents.learned_model import (
@@ -36,11 +34,12 @@ from sb3_mcbs.agents.learned_model import (
     set_up_learned_model,
 )
 from sb3_mcbs.agents.planner import Planner
+from sb3_mcbs.agents.presets import OF_PRESETS, decide_expansion, settings_of_preset
 from sb3_mcbs.agents.resumable import Resumable, Searching
 from sb3_mcbs.agents.roots import EnvironmentStep, Prediction
 from sb3_mcbs.agents.schedule import ScheduleSettings, SearchSchedule
 from sb3_mcbs.agents.tensorboard import write_candidates, write_hyperparameters
-from sb3_mcbs.agents.value_expansion import Expanding, ValueExpansionSettings
+from sb3_mcbs.agents.value_expansion import EXPANSION, Expanding, ValueExpansionSettings
 from sb3_mcbs.networks.torch_settings import matmul_precision
 from sb3_mcbs.search import RecentActions, SearchResult, SearchSettings
 from sb3_mcbs.search.random_streams import spawn_rng
@@ -144,7 +143,7 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
             self._schedule = SearchSchedule(schedule, self.seed)
         self._schedule.settings = schedule
         self._remember_actions(settings)
-        self._set_up_expansion()
+        self._check_buffer()
         set_up_learned_model(self)
         if self.env is not None:
             self._make_planner(self.env, settings)
@@ -157,10 +156,13 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
     def _follow_settings(self) -> None:
         settings, schedule = self.checked_settings()
         check_learned_model(self)
-        self._follow_expansion()
-        if self.planner is not None and self.planner.follow(settings):
+        self._check_buffer()
+        if self.planner is not None:
+            exchanged = self.planner.follow(settings)
             self._check_states()
-            self._say_what_simulates()
+            self._expand_buffer()
+            if self._expansion_has_changed() or exchanged:
+                self._say_what_simulates()
         self._remember_actions(settings)
         assert self._schedule is not None
         self._schedule.settings = schedule
@@ -184,6 +186,7 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
         self.planner = Planner(self, env, settings, normalize_reward, self.recent_actions)
         try:
             self._check_states()
+            self._expansion_has_changed()
             self._expand_buffer()
         except Exception:
             self.planner.close()
@@ -431,10 +434,12 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
         }
         objects = kwargs.get("custom_objects") or {}
         refuse_old_names({**{name: objects[name] for name in MOVED.keys() & objects.keys()}, **kwargs})
-        preset = kwargs.get("preset", objects.get("preset"))
-        if preset is not None:
-            beside = {name: objects[name] for name in SETTINGS.keys() & objects.keys()}
-            kwargs = merged(settings_of_preset(preset), {**beside, **kwargs})
+        given = {**{name: objects[name] for name in SETTINGS.keys() & objects.keys()}, **kwargs}
+        if given.get("preset") is not None:
+            kwargs = merged(settings_of_preset(given["preset"]), given)
+            kwargs |= decide_expansion(kwargs)
+        elif not given.keys().isdisjoint(EXPANSION):
+            kwargs["expansion_where_possible"] = None
         # Older files have the keys of these as attributes, which None would leave in place.
         kwargs = {name: {} if name in GROUPS and value is None else value for name, value in kwargs.items()}
         with moved_modules():

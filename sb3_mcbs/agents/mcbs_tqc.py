@@ -50,19 +50,23 @@ class MCBSTQC(MCBS, TQCSteps, TQC):
     :param strategy: ``"beam"``, ``"tree"`` or ``"cem"`` (None: the preset's, or ``"beam"``)
     :param search_kwargs: additional settings of the strategy, see :class:`~sb3_mcbs.BeamSettings`,
         :class:`~sb3_mcbs.TreeSettings` and :class:`~sb3_mcbs.CEMSettings`
-    :param preset: one of :data:`~sb3_mcbs.search.PRESETS`, from which the settings of the search start
+    :param preset: one of :data:`~sb3_mcbs.search.PRESETS`, from which the settings of the search start;
+        ``"train"`` also searches in half of the episodes, and learns from simulated transitions where batched
+        MuJoCo simulates
     :param search_schedule: when to search: ``"constant"``, ``"saturation"`` or ``"anneal"``
-    :param search_share: the share of decisions that are searched
-    :param search_unit: whether search is drawn for every ``"step"`` or every ``"episode"``
+    :param search_share: the share of decisions that are searched (None: the preset's, or 1)
+    :param search_unit: whether search is drawn for every ``"step"`` or every ``"episode"`` (None: the
+        preset's, or ``"step"``)
     :param schedule_kwargs: additional settings of the schedule, see
         :class:`~sb3_mcbs.agents.ScheduleSettings`
     :param forward_model: the simulator: ``"auto"``, ``"mujoco"``, ``"pool"`` or ``"ensemble"`` (learned)
     :param model_kwargs: additional settings of the forward model: ``n_threads``, and for ``"ensemble"`` those
         of :class:`~sb3_mcbs.agents.EnsembleSettings`
-    :param value_expansion: simulated steps before critic targets bootstrap (0: none, as in SB3)
+    :param value_expansion: simulated steps before critic targets bootstrap (0: none, as in SB3; None: the
+        preset's, or 0)
     :param expanded_share: the share of every batch that is expanded
     :param branch_length: expand simulated transitions of the current actor instead of stored ones: the
-        length of its rollouts from stored states (0: none)
+        length of its rollouts from stored states (0: none; None: the preset's, or 0)
     :param action_noise_after_search: add ``action_noise`` to searched actions too
     :param matmul_precision: precision of the networks' float32 products (None: the process's setting)
     :param cuda_graphs: on a GPU, capture the gradient steps of plain MLPs in CUDA graphs;
@@ -109,14 +113,14 @@ class MCBSTQC(MCBS, TQCSteps, TQC):
         search_kwargs: dict[str, Any] | None = None,
         preset: Preset | None = None,
         search_schedule: ScheduleName = "constant",
-        search_share: float = 1.0,
-        search_unit: SearchUnit = "step",
+        search_share: float | None = None,
+        search_unit: SearchUnit | None = None,
         schedule_kwargs: dict[str, Any] | None = None,
         forward_model: Backend = "auto",
         model_kwargs: dict[str, Any] | None = None,
-        value_expansion: int = 0,
+        value_expansion: int | None = None,
         expanded_share: float = 0.5,
-        branch_length: int = 0,
+        branch_length: int | None = None,
         action_noise_after_search: bool = False,
         matmul_precision: MatmulPrecision | None = None,
         cuda_graphs: bool = True,

@@ -18,10 +18,10 @@ from sb3_mcbs.agents.hyperparameters import (
     SETTINGS,
     RefusesOldNames,
     refuse_old_names,
-    settings_of_preset,
 )
 from sb3_mcbs.agents.mcbs import MCBS
 from sb3_mcbs.agents.planner import Planner
+from sb3_mcbs.agents.presets import settings_of_preset
 from sb3_mcbs.agents.resumable import Searching
 from sb3_mcbs.search import SearchResult, SearchSettings, make_settings, with_preset
 from sb3_mcbs.search.settings import KEYWORDS, merged

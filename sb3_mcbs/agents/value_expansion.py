@@ -23,6 +23,7 @@ from sb3_mcbs.agents.expanded_buffer import (
     compiled_target,
     drop_states,
     expand,
+    has_batched_states,
     make_room,
 )
 from sb3_mcbs.agents.planner import Planner
@@ -30,6 +31,8 @@ from sb3_mcbs.agents.roots import Prediction
 from sb3_mcbs.search import SearchSettings
 from sb3_mcbs.search.checks import CheckedSettings
 
+#: Settings that say whether targets are rolled forward, and how.
+EXPANSION = ("value_expansion", "branch_length")
 #: A larger value is surely a mistake.
 MAX_EXPANSION = 1000
 MAX_BRANCH_LENGTH = 100_000
@@ -109,6 +112,8 @@ class Expanding(CheckedRollouts):
     Every step, searched or not, is then compared with the simulator's prediction.
 
     :ivar rollout_rng: samples the transitions to expand, separately from the agent's generators.
+    :ivar expansion_where_possible: the preset's value expansion if no other was given: the attributes have
+        these values where the forward model allows it, and are 0 elsewhere.
     """
 
     value_expansion: int
@@ -119,24 +124,13 @@ class Expanding(CheckedRollouts):
     #: Simulated rollouts that are not part of saved agents; exact checkpoints contain them.
     branches: Branches | None = None
     rollout_rng: np.random.Generator | None = None
-    _keeps_states = False
+    expansion_where_possible: dict[str, int] | None = None
+    _known_expansion = (False, False)
     #: The states in which the next actions are executed.
     _states: np.ndarray | None = None
 
-    def _set_up_expansion(self) -> None:
-        self._check_buffer()
-        self._keeps_states = self.value_expansion > 0
-
-    def _follow_expansion(self) -> None:
-        """Refuse changed settings that need other arrays in the replay buffer."""
-        self._check_buffer()
-        if (self.value_expansion > 0) != self._keeps_states:
-            raise ValueError(
-                "value_expansion stores states in the replay buffer: it can be changed later, but not "
-                "from or to 0; save the agent, and load it with the other settings."
-            )
-
     def _check_buffer(self) -> None:
+        """Refuse replay buffers that cannot be expanded."""
         if self.replay_buffer is not None:  # it may have been taken away
             ValueExpansionSettings.of(self).check_buffer(self.replay_buffer.optimize_memory_usage)
 
@@ -147,7 +141,6 @@ class Expanding(CheckedRollouts):
         :return: ``None`` without a ``branch_length``.
         """
         if not self.branch_length:
-            self.branches = None  # later they would be those of an old actor
             return None
         n_sampled = round(self.expanded_share * self.batch_size)
         shape = n_rollouts(n_sampled, self.value_expansion), self.value_expansion, self.branch_length
@@ -159,10 +152,22 @@ class Expanding(CheckedRollouts):
 
     def _check_states(self) -> None:
         """Refuse a forward model whose states cannot be kept, and drop states that it cannot go on from."""
+        if self.expansion_where_possible:
+            possible = has_batched_states(self)
+            vars(self).update(self.expansion_where_possible if possible else dict.fromkeys(EXPANSION, 0))
+            self._check_buffer()
         if self.value_expansion:
             state_size = batched_states(self).shape[1]
             if isinstance(self.replay_buffer, ExpandedReplayBuffer):
                 make_room(self.replay_buffer, state_size)
+
+    def _expansion_has_changed(self) -> bool:
+        """Whether value expansion was switched on or off since the last call, or may now be left out."""
+        if not self.branch_length:
+            self.branches = None  # later they would be those of an old actor
+        before, now = self._known_expansion, (self.value_expansion > 0, bool(self.expansion_where_possible))
+        self._known_expansion = now
+        return before != now
 
     def _expand_buffer(self) -> None:
         """Convert the replay buffer, before every use, since loading one replaces it."""
@@ -173,7 +178,8 @@ class Expanding(CheckedRollouts):
     def _expansion_in_words(self) -> str:
         """How samples are rolled forward; empty if they are not."""
         if not self.value_expansion:
-            return ""
+            left_out = "; value expansion is left out: it needs batched MuJoCo"
+            return left_out if self.expansion_where_possible else ""
         if self.branch_length:
             return f"; branches {way('every transition of theirs is kept')}"
         try:

@@ -6,10 +6,13 @@ import numpy as np
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 
+from sb3_mcbs.agents.expanded_buffer import ARRAYS as EXPANSION_ARRAYS
+from sb3_mcbs.agents.expanded_buffer import make_room
 from sb3_mcbs.checkpoints.errors import CheckpointError
 
 #: Buffers that only ever write the row at their position, the one before and the one after.
 KNOWN = (ReplayBuffer, NStepReplayBuffer, DictReplayBuffer, HerReplayBuffer)
+STATES = EXPANSION_ARRAYS[0]
 #: What HER writes into older rows too is small, so all of it is part of every checkpoint.
 REWRITTEN = ("ep_start", "ep_length")
 
@@ -90,19 +93,22 @@ def read_rows(buffer: ReplayBuffer, first: int, end: int) -> dict[str, np.ndarra
 def write_rows(buffer: ReplayBuffer, parts: list[dict[str, np.ndarray]]) -> None:
     """Put rows back.
 
-    :param buffer: an equal buffer.
+    :param buffer: an equal buffer. It gets the states of value expansion that was switched on in the run.
     :param parts: from :func:`read_rows`, in the order in which they were read.
     :raises CheckpointError: if they are of another buffer.
     """
+    if parts and STATES in parts[-1]:
+        make_room(buffer, parts[-1][STATES].shape[-1])
     arrays = row_arrays(buffer)
     for part in parts:
         part = dict(part)
         positions = part.pop("positions")
-        if part.keys() != arrays.keys():
+        if part.keys() != arrays.keys() and part.keys() != arrays.keys() - {*EXPANSION_ARRAYS}:
             raise CheckpointError(f"The rows hold {sorted(part)}, this replay buffer {sorted(arrays)}.")
         if len(positions) and not (positions.min() >= 0 and positions.max() < buffer.buffer_size):
             raise CheckpointError("The rows are of a larger replay buffer.")
-        for name, array in arrays.items():
+        for name in part:
+            array = arrays[name]
             if part[name].dtype != array.dtype or part[name].shape[1:] != array.shape[1:]:
                 raise CheckpointError(
                     f"The rows' {name} are {part[name].dtype} {part[name].shape[1:]}, this replay buffer's "

@@ -295,11 +295,15 @@ def _warn_of_old_name() -> None:
     warnings.warn(message, FutureWarning, stacklevel=4)
 
 
+_EFFICIENT: dict[str, Any] = dict(
+    n_simulations=1, search_kwargs=dict(rollout_noise=0.0, include_policy_action=True)
+)
 #: The settings of presets that differ from the defaults. In deterministic environments "efficient",
-#: "balanced" and "strong" simulate about 20, 110 and 580 steps per decision.
+#: "balanced" and "strong" simulate about 20, 110 and 580 steps per decision. "train" searches as "efficient"
+#: does; what it says about the training is the agents' business.
 PRESETS: dict[Preset, dict[str, Any]] = {
     "paper": {},
-    "efficient": dict(n_simulations=1, search_kwargs=dict(rollout_noise=0.0, include_policy_action=True)),
+    "efficient": _EFFICIENT,
     "balanced": dict(strategy="cem", beam_width=12, n_simulations=1, search_kwargs=dict(antithetic=True)),
     "strong": dict(
         strategy="cem",
@@ -308,6 +312,7 @@ PRESETS: dict[Preset, dict[str, Any]] = {
         n_simulations=1,
         search_kwargs=dict(n_rounds=4, n_elites=4, antithetic=True),
     ),
+    "train": _EFFICIENT,
 }
 
 

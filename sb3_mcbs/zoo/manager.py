@@ -26,8 +26,8 @@ from sb3_mcbs.agents.hyperparameters import (
     REMOVED,
     SETTINGS,
     refuse_old_names,
-    settings_of_preset,
 )
+from sb3_mcbs.agents.presets import settings_of_preset
 from sb3_mcbs.agents.registry import BASELINES, SEARCHING
 from sb3_mcbs.agents.schedule import SCHEDULES, UNITS
 from sb3_mcbs.checkpoints import CheckpointError, ExactCheckpointCallback
