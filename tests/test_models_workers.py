@@ -1,6 +1,7 @@
 """Environments in worker processes are simulated as those of this process are."""
 
 import gc
+import traceback
 from collections.abc import Iterator
 from typing import Any
 
@@ -190,6 +191,11 @@ def test_a_worker_that_has_ended_is_reported() -> None:
     environments = WorkerEnvironments(vec_env)
     vec_env.processes[0].kill()
     vec_env.processes[0].join()
-    with pytest.raises(WorkerError, match=r"environment 0 was killed by SIGKILL \(exit code -9\)"):
+    with pytest.raises(WorkerError, match=r"environment 0 was killed by SIGKILL \(exit code -9\)") as caught:
         environments.apply([0], describe)
+    # Python 3.12.1 crashes later if the error keeps the buffer that could not be sent.
+    assert isinstance(caught.value.__cause__, BrokenPipeError)
+    frames = [frame for frame, _ in traceback.walk_tb(caught.value.__cause__.__traceback__)]
+    assert "_send" in [frame.f_code.co_name for frame in frames]
+    assert not [frame for frame in frames if any(isinstance(x, memoryview) for x in frame.f_locals.values())]
     vec_env.close()

@@ -45,7 +45,7 @@ def environment_named(vec_env: VecEnv) -> Iterator[None]:
     except Exception as error:
         base = vec_env.unwrapped
         if isinstance(base, SubprocVecEnv) and isinstance(error, EOFError | OSError):
-            reason = worker_error(base)
+            reason = worker_error(base, error)
             if reason is not None:
                 raise reason from error
         for frame, _ in traceback.walk_tb(error.__traceback__):

@@ -146,7 +146,7 @@ class WorkerEnvironments(Environments):
             # All answers are received before any error is raised, so that none is left in a pipe.
             answers = [remote.recv() for remote in remotes]
         except (EOFError, OSError) as error:
-            reason = worker_error(self.vec_env)
+            reason = worker_error(self.vec_env, error)
             if reason is None:
                 raise
             raise reason from error

@@ -75,10 +75,11 @@ def await_answers(vec_env: SubprocVecEnv, env_indices: Sequence[int]) -> None:
             del waiting[remote]
 
 
-def worker_error(vec_env: SubprocVecEnv) -> WorkerError | None:
+def worker_error(vec_env: SubprocVecEnv, cause: Exception) -> WorkerError | None:
     """Find out which worker ended, stop the others and close the vectorized environment.
 
     :param vec_env: environments of which one did not answer.
+    :param cause: what talking to the workers raised; its traceback keeps no variables of calls that ended.
     :return: the error to raise; None if all workers are alive, or were closed on purpose.
     """
     if vec_env.closed:
@@ -96,6 +97,9 @@ def worker_error(vec_env: SubprocVecEnv) -> WorkerError | None:
     first = max(ended, key=lambda index: (bool(left[index]), processes[index].exitcode != 0))
     exit_code, text = processes[first].exitcode, left[first]
     _shut_down(vec_env)
+    # A command that could not be sent is a buffer in these frames. The garbage collector of some Pythons
+    # (3.12.1 is one) crashes on a buffer in the reference cycle of an error and its traceback.
+    traceback.clear_frames(cause.__traceback__)
     trace = f"Its traceback:\n{text}" if text else "It left no traceback" + _hint(exit_code)
     message = (
         f"The worker process of environment {first} {_ending(exit_code)}. The other workers were stopped and "
