@@ -228,7 +228,7 @@ OWN = {
     "action_noise_after_search": st.booleans(),
     "fast_update": st.booleans(),
     "cuda_graphs": st.booleans(),
-    "preset": st.sampled_from([None, "paper", "efficient", "balanced"]),
+    "preset": st.sampled_from([None, "paper", "efficient", "balanced", "train"]),
     "action_noise": st.sampled_from([None, NormalActionNoise(np.zeros(1), np.ones(1))]),
 }
 owned = st.tuples(valid_mostly, st.fixed_dictionaries({}, optional=OWN)).map(lambda pair: pair[0] | pair[1])
