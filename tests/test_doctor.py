@@ -259,9 +259,9 @@ def test_rl_zoo_trains_with_the_block(
 ) -> None:
     monkeypatch.syspath_prepend(ENVS.parent)
     block = report.block(findings(name, *wrappers), name, [*wrappers])
-    assert block is not None and " ".join(["--algo mcbs_td3 --env", env_id]) in block
+    assert block is not None and " ".join(["--algo mcbs_crossq --env", env_id]) in block
     assert all(word in block for word in words)
     (tmp_path / "doctor.yml").write_text(block)
     words = ("-conf", "doctor.yml", "-n", "150", "--eval-freq", "-1", *words, "-params", *TINY)
-    zoo_train(monkeypatch, tmp_path, "mcbs_td3", *words, env=env_id)
+    zoo_train(monkeypatch, tmp_path, "mcbs_crossq", *words, env=env_id)
     assert "Trained for 150 environment steps" in capsys.readouterr().out

@@ -25,7 +25,9 @@ def recipe(findings: dict[str, Any], name: str, wrappers: list[str], exact: bool
     :param simulate: whether training can afford to simulate
     :return: YAML
     """
-    algo = f"mcbs_{findings.get('agent', {}).get('base', 'td3')}"
+    # Without an agent, the algorithm that needs the fewest steps; it takes no images and dictionaries.
+    base = "crossq" if findings["environment"]["policy"] == "MlpPolicy" else "td3"
+    algo = f"mcbs_{findings.get('agent', {}).get('base', base)}"
     known = yaml.safe_load(hyperparams_path(algo).read_text())
     module, _, function = name.rpartition(":")
     env_id = f"{findings['environment']['class']}-v0" if is_file(name) else function
@@ -42,8 +44,8 @@ def recipe(findings: dict[str, Any], name: str, wrappers: list[str], exact: bool
         ]
     entry = known.get(env_id) if not wrappers else None
     if entry is None or not exact or (entry.get("rollout_depth") == 0) == simulate:
-        base = known.get(env_id, known["default"])
-        entry = {key: value for key, value in base.items() if key not in SETTINGS}
+        like = known.get(env_id, known["default"])
+        entry = {key: value for key, value in like.items() if key not in SETTINGS}
         entry |= _search(known, findings, exact, simulate)
     layers = [*wrappers, _SNAPSHOTS] if exact else wrappers
     entry = {key: value for key, value in entry.items() if key != "env_wrapper"}
@@ -68,4 +70,5 @@ def _search(known: dict[str, Any], findings: dict[str, Any], exact: bool, simula
         return {"preset": "efficient", "search_share": 0.5, "search_unit": "episode"}
     else:
         like = known[FAST]
-    return {key: value for key, value in like.items() if key in SETTINGS}
+    # With simulated transitions the actor is updated more often.
+    return {key: value for key, value in like.items() if key in (*SETTINGS, "policy_delay")}
