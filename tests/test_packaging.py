@@ -13,6 +13,7 @@ from itertools import chain
 from pathlib import Path
 
 import pytest
+import yaml
 
 import _sb3_mcbs_build as build
 
@@ -43,6 +44,44 @@ def test_every_dependency_is_open_in_the_metadata_and_pinned_in_the_constraints(
     assert not [requirement for requirement in requirements if "==" in requirement or "<" in requirement]
     assert {normalised(requirement) for requirement in requirements} <= set(pins)
     assert pins["torch"] == "2.13.0"
+
+
+def test_continuous_integration_tries_the_oldest_versions() -> None:
+    jobs = yaml.safe_load((ROOT / ".github" / "workflows" / "ci.yml").read_text())["jobs"]
+    tried = {each["name"]: each["versions"] for each in jobs["versions"]["strategy"]["matrix"]["include"]}
+    project = METADATA["project"]
+    bounds = {
+        normalised(entry): entry.partition(">=")[2]
+        for entry in [*project["dependencies"], *project["optional-dependencies"]["zoo"]]
+        if ">=" in entry
+    }
+    pins = {normalised(entry): entry.partition("==")[2] for entry in tried["oldest"].split()}
+    assert pins.keys() == bounds.keys()
+    assert all(pins[name] in (bound, f"{bound}.0") for name, bound in bounds.items()), (pins, bounds)
+    pythons = jobs["check"]["strategy"]["matrix"]["python-version"]
+    named = [entry.rpartition(" ")[2] for entry in project["classifiers"] if re.search(r":: 3\.\d+$", entry)]
+    assert pythons == named
+
+
+def test_page_of_versions_names_the_bounds_and_the_pins(pins: dict[str, str]) -> None:
+    page = (ROOT / "docs" / "versions.md").read_text()
+    rows = [[cell.strip() for cell in line.split("|")[1:4]] for line in page.splitlines() if "|" in line]
+    cells = {name: (oldest, pinned) for name, oldest, pinned in rows}
+    project = METADATA["project"]
+    needed = " ".join([*project["dependencies"], *project["optional-dependencies"]["zoo"]])
+    for name, distribution in {
+        "PyTorch": "torch",
+        "Stable-Baselines3, SB3-Contrib": "stable-baselines3",
+        "Gymnasium": "gymnasium",
+        "MuJoCo": "mujoco",
+        "Numba": "numba",
+        "RL Zoo (extra `zoo`)": "rl-zoo3",
+        "Optuna (extra `zoo`)": "optuna",
+    }.items():
+        oldest, pinned = cells[name]
+        bound = re.search(rf"(?:^| ){distribution}(?:\[\w+\])?>=(\S+)", needed)
+        assert oldest.removesuffix(".0") == (bound[1] if bound else ""), name
+        assert pinned == pins[distribution], name
 
 
 def test_commands_of_rl_zoo_find_what_they_import() -> None:
