@@ -1,6 +1,7 @@
 # sb3-mcbs with RL Zoo's commands, for processors:
 #   docker build -t sb3-mcbs .
-#   docker run --rm -v "$PWD/logs:/work/logs" sb3-mcbs train --algo mcbs_td3 --env HalfCheetah-v5
+#   mkdir -p logs
+#   docker run --rm --user "$(id -u)" -v "$PWD/logs:/work/logs" sb3-mcbs train --algo mcbs_td3 --env HalfCheetah-v5
 # For a GPU of NVIDIA: docker build --build-arg TORCH_INDEX=https://pypi.org/simple, and docker run --gpus all.
 ARG PYTHON=3.11
 FROM python:${PYTHON}-slim
@@ -20,7 +21,9 @@ RUN pip install --index-url ${TORCH_INDEX} "$(grep '^torch==' /tmp/constraints.t
 COPY . /src
 RUN pip install -c /tmp/constraints.txt "/src[zoo,plots,report,video,hub,onnx]" && rm -rf /src
 
-RUN useradd --create-home user && mkdir /work && chown user /work
+# Any user may be given to docker run, who then owns what is written to logs/; caches go to /tmp.
+ENV HOME=/tmp USER=user
+RUN useradd --no-create-home user && mkdir --mode 1777 /work
 USER user
 WORKDIR /work
 ENTRYPOINT ["sb3-mcbs"]

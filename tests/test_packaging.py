@@ -2,8 +2,10 @@
 
 import os
 import re
+import shutil
 import subprocess
 import sys
+import tarfile
 import tomllib
 import zipfile
 from collections.abc import Iterator
@@ -11,6 +13,7 @@ from itertools import chain
 from pathlib import Path
 
 import pytest
+import yaml
 
 import _sb3_mcbs_build as build
 
@@ -41,6 +44,44 @@ def test_every_dependency_is_open_in_the_metadata_and_pinned_in_the_constraints(
     assert not [requirement for requirement in requirements if "==" in requirement or "<" in requirement]
     assert {normalised(requirement) for requirement in requirements} <= set(pins)
     assert pins["torch"] == "2.13.0"
+
+
+def test_continuous_integration_tries_the_oldest_versions() -> None:
+    jobs = yaml.safe_load((ROOT / ".github" / "workflows" / "ci.yml").read_text())["jobs"]
+    tried = {each["name"]: each["versions"] for each in jobs["versions"]["strategy"]["matrix"]["include"]}
+    project = METADATA["project"]
+    bounds = {
+        normalised(entry): entry.partition(">=")[2]
+        for entry in [*project["dependencies"], *project["optional-dependencies"]["zoo"]]
+        if ">=" in entry
+    }
+    pins = {normalised(entry): entry.partition("==")[2] for entry in tried["oldest"].split()}
+    assert pins.keys() == bounds.keys()
+    assert all(pins[name] in (bound, f"{bound}.0") for name, bound in bounds.items()), (pins, bounds)
+    pythons = jobs["check"]["strategy"]["matrix"]["python-version"]
+    named = [entry.rpartition(" ")[2] for entry in project["classifiers"] if re.search(r":: 3\.\d+$", entry)]
+    assert pythons == named
+
+
+def test_page_of_versions_names_the_bounds_and_the_pins(pins: dict[str, str]) -> None:
+    page = (ROOT / "docs" / "versions.md").read_text()
+    rows = [[cell.strip() for cell in line.split("|")[1:4]] for line in page.splitlines() if "|" in line]
+    cells = {name: (oldest, pinned) for name, oldest, pinned in rows}
+    project = METADATA["project"]
+    needed = " ".join([*project["dependencies"], *project["optional-dependencies"]["zoo"]])
+    for name, distribution in {
+        "PyTorch": "torch",
+        "Stable-Baselines3, SB3-Contrib": "stable-baselines3",
+        "Gymnasium": "gymnasium",
+        "MuJoCo": "mujoco",
+        "Numba": "numba",
+        "RL Zoo (extra `zoo`)": "rl-zoo3",
+        "Optuna (extra `zoo`)": "optuna",
+    }.items():
+        oldest, pinned = cells[name]
+        bound = re.search(rf"(?:^| ){distribution}(?:\[\w+\])?>=(\S+)", needed)
+        assert oldest.removesuffix(".0") == (bound[1] if bound else ""), name
+        assert pinned == pins[distribution], name
 
 
 def test_commands_of_rl_zoo_find_what_they_import() -> None:
@@ -173,6 +214,36 @@ def installed(
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(not (ROOT / ".git").exists(), reason="compares with what git tracks")
+def test_distributions_hold_what_git_tracks(tmp_path: Path) -> None:
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True)
+    tracked = {name for name in listed.stdout.splitlines() if (ROOT / name).is_file()}
+    source = tmp_path / "source"
+    for name in tracked:
+        (source / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(ROOT / name, source / name)
+    words = [
+        "-m",
+        "build",
+        "--no-isolation",
+        "--outdir",
+        tmp_path,
+        source,
+    ]  # the wheel from the source archive
+    done = subprocess.run([sys.executable, *words], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    with tarfile.open(next(tmp_path.glob("*.tar.gz"))) as archive:
+        packed = {name.partition("/")[2] for name in archive.getnames()}
+    assert tracked - packed == {".gitignore"}
+    with zipfile.ZipFile(next(tmp_path.glob("*.whl"))) as wheel:
+        installed = set(wheel.namelist())
+    ours = {name for name in tracked if name.startswith("sb3_mcbs/")}
+    ours |= {f"sb3_mcbs/{name}" for name in tracked if name.startswith("hyperparams/")}
+    ours |= {"_sb3_mcbs_hook.py", build.PTH_NAME}
+    assert {name for name in installed if ".dist-info/" not in name} == ours
+
+
+@pytest.mark.slow
 def test_installation_registers_in_any_folder(installed: Environment, tmp_path: Path) -> None:
     code = (
         "import sys; assert not [m for m in sys.modules if m.startswith(('sb3_mcbs', 'rl_zoo3', 'torch'))];"
@@ -190,18 +261,22 @@ def test_installation_registers_in_any_folder(installed: Environment, tmp_path: 
 @pytest.mark.slow
 def test_scripts_of_users_are_type_checked(installed: Environment, tmp_path: Path) -> None:
     (tmp_path / "script.py").write_text(
+        "import gymnasium as gym\n"
         "from sb3_mcbs import MCBSTD3, SearchPolicy\n"
         "def search(policy: SearchPolicy) -> None:\n"
         "    reveal_type(policy.beam_width)\n"
         "    reveal_type(policy.predict)\n"
+        'agent = MCBSTD3("MlpPolicy", "Pendulum-v1", preset="efficient", strategy="cem")\n'
         'MCBSTD3("MlpPolicy", "Pendulum-v1", strategy="beem")\n'
+        'SearchPolicy(agent, gym.make("Pendulum-v1"), preset="balance")\n'
     )
     words = [sys.executable, "-m", "mypy", "--python-executable", installed.python, "script.py"]
     done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert 'script.py:3: note: Revealed type is "int"' in done.stdout, done.stdout + done.stderr
-    assert 'script.py:4: note: Revealed type is "def (observation' in done.stdout
-    assert 'script.py:5: error: Argument "strategy" to "MCBSTD3" has incompatible type' in done.stdout
-    assert "Found 1 error" in done.stdout
+    assert 'script.py:4: note: Revealed type is "int"' in done.stdout, done.stdout + done.stderr
+    assert 'script.py:5: note: Revealed type is "def (observation' in done.stdout
+    assert 'script.py:7: error: Argument "strategy" to "MCBSTD3" has incompatible type' in done.stdout
+    assert 'script.py:8: error: Argument "preset" to "SearchPolicy" has incompatible type' in done.stdout
+    assert "Found 2 errors" in done.stdout
 
 
 @pytest.mark.slow

@@ -319,7 +319,8 @@ def deep(n):
 @pytest.mark.parametrize(
     "make, path, reason",
     [
-        (threading.Thread, r"\.thing\._started\._cond\._lock", "_thread.lock"),
+        # From Python 3.13 on, a thread's first attribute is its handle.
+        (threading.Thread, r"\.thing\.(_started\._cond\._lock|_handle)", "_thread.(lock|_ThreadHandle)"),
         (threading.RLock, r"\.thing", "_thread.RLock"),
         (queue.Queue, r"\.thing\.mutex", "_thread.lock"),
         (lambda: Nested([open(__file__)]), r"\.thing\.inside\[0\]", "open file, socket or pipe"),  # noqa: SIM115
