@@ -8,7 +8,9 @@ import torch as th
 from gymnasium import spaces
 from sb3_contrib import TQC, CrossQ
 from sb3_contrib.common.torch_layers import BatchRenorm1d
+from sb3_contrib.crossq import policies as crossq_policies
 from stable_baselines3 import DDPG, SAC, TD3
+from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_mcbs import MCBSTD3, MCBSCrossQ
@@ -18,6 +20,9 @@ from sb3_mcbs.networks.mlp import MLP
 from sb3_mcbs.networks.plain_networks import actor_mlp, critic_mlps
 from sb3_mcbs.networks.torch_settings import matmul_precision, one_thread
 from tests.conftest import SMALL
+from tests.graph_helpers import GRAPHED, TANH, agent_with_steps, assert_alike, train
+
+CROSSQ = (CrossQ, GRAPHED[CrossQ])
 
 
 def agent_of(cls, settings=MappingProxyType({}), **policy_kwargs):
@@ -116,8 +121,10 @@ def test_batch_renormalization_has_the_present_statistics():
 
 def test_batch_renormalization_that_is_not_covered():
     layer = BatchRenorm1d(2)
-    with pytest.raises(TypeError, match="trained on the statistics of batches"):
-        _ = MLP(layer).parameters
+    layer.train = lambda mode=True: layer
+    with pytest.raises(TypeError, match="replaced train method"):
+        MLP(layer)
+    layer = BatchRenorm1d(2)
     layer.register_buffer("more", th.zeros(2))
     with pytest.raises(TypeError, match="other parameters or statistics"):
         MLP(layer)
@@ -181,6 +188,167 @@ def test_crossq_trains_as_sb3_contrib_does(policy_delay):
         assert values[1] == pytest.approx(values[0], rel=1e-3), name
 
 
+def crossq_agents(settings=MappingProxyType({}), **policy_kwargs):
+    """SB3-Contrib's and ours in the same state, with transitions to learn from and learned statistics."""
+    agents = [agent_with_steps(cls, policy_kwargs=TANH | policy_kwargs, **settings) for cls in CROSSQ]
+    for agent in agents:
+        th.manual_seed(2)
+        change_normalization(agent)
+    return agents
+
+
+@pytest.mark.parametrize("warmup_steps", [1000, -1])
+@pytest.mark.parametrize(
+    "policy_kwargs",
+    [
+        {},
+        dict(activation_fn=th.nn.ReLU),
+        dict(n_critics=1, net_arch=[8]),
+        dict(n_critics=3, net_arch=dict(pi=[8, 7, 6], qf=[])),
+        dict(batch_norm=False),
+    ],
+)
+@pytest.mark.parametrize("policy_delay", [1, 2])
+def test_gradients_of_crossq_are_sb3_contribs(policy_kwargs, warmup_steps, policy_delay):
+    # Adam hides factors, so the gradients themselves are compared. In a step of the actor SB3-Contrib adds
+    # gradients to the critics' that it does not use.
+    settings = {"policy_delay": policy_delay, "ent_coef": "auto_0.2"}
+    theirs, ours = crossq_agents(settings, renorm_warmup_steps=warmup_steps, **policy_kwargs)
+    assert ours._present_update() is not None
+    for agent in (theirs, ours):
+        agent.set_random_seed(1)
+        agent.train(gradient_steps=1, batch_size=64)
+    network = "actor" if policy_delay == 1 else "critic"
+    pairs = [getattr(agent, network).named_parameters() for agent in (theirs, ours)]
+    for (name, expected), (_, found) in zip(*pairs, strict=True):
+        scale = float(expected.grad.abs().max())
+        th.testing.assert_close(found.grad, expected.grad, rtol=1e-3, atol=1e-4 * scale + 1e-6, msg=name)
+    if policy_delay == 1:
+        th.testing.assert_close(ours.log_ent_coef.grad, theirs.log_ent_coef.grad)
+
+
+def with_new_adams(change):
+    def changed(agent):
+        th.manual_seed(3)
+        change(agent)
+        for network in (agent.actor, agent.critic):
+            network.optimizer = th.optim.Adam(network.parameters(), lr=1e-3)
+
+    return changed
+
+
+@with_new_adams
+def tied_critics(agent):
+    agent.critic.qf1[4] = agent.critic.qf0[4]
+
+
+@with_new_adams
+def tied_normalization(agent):
+    agent.critic.qf1[3] = agent.critic.qf0[3]
+
+
+@with_new_adams
+def shared_by_actor_and_critic(agent):
+    agent.actor.latent_pi[4] = agent.critic.qf0[4]
+
+
+@with_new_adams
+def mean_is_deviation(agent):
+    agent.actor.log_std = agent.actor.mu
+
+
+@with_new_adams
+def a_layer_twice(agent):
+    layer = th.nn.Linear(12, 12)
+    agent.actor.latent_pi.extend([layer, th.nn.Tanh(), layer])
+
+
+@with_new_adams
+def normalized_mean(agent):
+    agent.actor.mu = th.nn.Sequential(BatchRenorm1d(12), agent.actor.mu)
+
+
+def pinned_mode(agent):
+    for layer in agent.critic.modules():
+        if isinstance(layer, BatchRenorm1d):
+            layer.eval()
+            layer.train = lambda mode=True, layer=layer: layer
+
+
+def other_density(agent):
+    distribution = agent.actor.action_dist
+    log_prob = distribution.log_prob
+    distribution.log_prob = lambda *args: 3 * log_prob(*args)
+
+
+LEFT_TO_SB3_CONTRIB = {
+    tied_critics: "a parameter is used twice",
+    tied_normalization: "a parameter is used twice",
+    shared_by_actor_and_critic: "a parameter is used twice",
+    mean_is_deviation: "a parameter is used twice",
+    a_layer_twice: "a parameter is used twice",
+    normalized_mean: "mean and standard deviation contain batch renormalization",
+    pinned_mode: "a replaced train method",
+    other_density: "a method of the actor's distribution was replaced",
+}
+
+
+@pytest.mark.parametrize("change", LEFT_TO_SB3_CONTRIB)
+def test_a_changed_crossq_is_left_to_sb3_contrib(change):
+    theirs, ours = crossq_agents({"policy_delay": 1})
+    for agent in (theirs, ours):
+        change(agent)
+        train(agent, 6)
+    assert LEFT_TO_SB3_CONTRIB[change] in "".join(ours._reasons_said)
+    assert_alike(theirs, ours, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(
+    "owner, name, value",
+    [
+        (crossq_policies.Actor, "action_log_prob", None),
+        (crossq_policies, "LOG_STD_MAX", -1.5),
+        (SquashedDiagGaussianDistribution, "log_prob_from_params", None),
+    ],
+)
+def test_what_sb3_contribs_actor_uses_may_be_replaced(owner, name, value, monkeypatch):
+    ours = agent_with_steps(GRAPHED[CrossQ])
+    assert ours._present_update() is not None
+    monkeypatch.setattr(owner, name, value)
+    assert ours._present_update() is None
+    assert f"{owner.__name__}.{name} was replaced" in "".join(ours._reasons_said)
+
+
+def test_batch_renormalization_is_left_in_the_same_mode():
+    for agent in crossq_agents():
+        agent.policy.set_training_mode(True)  # as modules are made
+        agent.train(1, 16)
+        layers = [layer for layer in agent.policy.modules() if isinstance(layer, BatchRenorm1d)]
+        assert layers and not any(layer.training for layer in layers)
+
+
+def test_the_default_type_of_numbers_may_be_another():
+    theirs, ours = crossq_agents({"policy_delay": 1})
+    th.set_default_dtype(th.float64)
+    try:
+        train(theirs, 6), train(ours, 6)
+    finally:
+        th.set_default_dtype(th.float32)
+    assert ours._present_update() is not None
+    assert_alike(theirs, ours)
+
+
+@pytest.mark.parametrize("cls, batch_size", [(MCBSTD3, 100), (MCBSCrossQ, 64)])
+def test_the_default_batch_size_is_sb3s(cls, batch_size, monkeypatch):
+    agent = agent_of(cls, {"search_share": 0.0, "learning_starts": 20})
+    agent.learn(20)
+    sample, sizes = agent.replay_buffer.sample, []
+    agent.replay_buffer.sample = lambda size, **kwargs: sizes.append(size) or sample(size, **kwargs)
+    for agent.fast_update in (True, False):
+        agent.train(gradient_steps=1)
+    assert sizes == [batch_size, batch_size]
+
+
 def test_hooks_run():
     agent = agent_of(TD3)
     agent.actor.mu[1].register_forward_hook(lambda module, inputs, output: output * 0)
@@ -209,7 +377,12 @@ def test_other_layers_are_named():
 def test_gradients_against_autograd():
     th.manual_seed(0)
     network = th.nn.Sequential(
-        th.nn.Linear(4, 8), th.nn.ReLU(), th.nn.Linear(8, 6, bias=False), th.nn.Tanh(), th.nn.Linear(6, 2)
+        th.nn.Linear(4, 8),
+        th.nn.ReLU(),
+        th.nn.Linear(8, 6, bias=False),
+        th.nn.Tanh(),
+        th.nn.Tanh(),
+        th.nn.Linear(6, 2),
     )
     rows = th.randn(5, 4, requires_grad=True)
     weight = th.randn(5, 2)
@@ -246,6 +419,9 @@ def test_process_wide_settings_are_put_back():
 def test_the_update_that_is_used(capsys):
     fast = MCBSTD3("MlpPolicy", "Pendulum-v1", verbose=1, **SMALL)
     assert fast._present_update() is not None
+    fast.actor.mu[0] = BatchRenorm1d(3)
+    assert fast._present_update() is None
+    assert "batch renormalization, which has two modes" in capsys.readouterr().out
     own = MCBSTD3("MlpPolicy", "Pendulum-v1", fast_update=False, **SMALL)
     assert own._present_update() is None
     capsys.readouterr()

@@ -371,12 +371,12 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
             known = self._noise_without_search is not None
             self._noise_without_search = noise_without_search(self, self.beam_noise, say=not known)
 
-    def train(self, gradient_steps: int, batch_size: int = 100) -> None:
+    def train(self, gradient_steps: int, batch_size: int | None = None) -> None:
         """
         Update the networks as the agent without search does.
 
         :param gradient_steps: number of gradient steps
-        :param batch_size: transitions per gradient step
+        :param batch_size: transitions per gradient step (None: SB3's default)
         """
         if self.learned_model is not None:
             self.learned_model.fit_if_due(self, EnsembleSettings.of(self))

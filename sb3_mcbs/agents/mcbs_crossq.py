@@ -69,6 +69,7 @@ class MCBSCrossQ(MCBS, CrossQSteps, CrossQ):
     :param action_noise_after_search: add ``action_noise`` to searched actions too
     :param matmul_precision: precision of the networks' float32 products (None: the process's setting)
     :param fast_update: compute gradient steps of plain MLPs with SB3's mathematics but fewer instructions;
+        other networks use SB3's own
     :param cuda_graphs: on a GPU, capture the gradient steps of plain MLPs in CUDA graphs;
         other networks use SB3's own steps
     """

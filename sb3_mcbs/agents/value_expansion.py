@@ -216,9 +216,9 @@ class Expanding(CheckedRollouts):
         self._expand_buffer()
         return super().collect_rollouts(*args, **kwargs)
 
-    def train(self, gradient_steps: int, batch_size: int = 100) -> None:
+    def train(self, *args: Any, **kwargs: Any) -> None:
         self._expand_buffer()
-        super().train(gradient_steps, batch_size)
+        super().train(*args, **kwargs)
 
     def _store_valid_transition(self, *transition: Any) -> None:
         if self.value_expansion:

@@ -4,7 +4,6 @@ from typing import Any, NamedTuple
 
 import torch as th
 from sb3_contrib.common.torch_layers import BatchRenorm1d
-from torch import nn
 
 from sb3_mcbs.networks.layers import check_parameter, gradient_of, own_state
 
@@ -32,7 +31,8 @@ class Renormalization:
     """The present parameters and statistics of a batch renormalization.
 
     :param layer: the layer.
-    :raises TypeError: if it has other parameters or statistics than SB3-Contrib gives it.
+    :raises TypeError: if it has other parameters or statistics than SB3-Contrib gives it, or chooses its mode
+        itself.
 
     :ivar layer: the layer.
     """
@@ -45,9 +45,11 @@ class Renormalization:
         named = [*parameters, *statistics] == ["scale", "bias", "ra_mean", "ra_var", "steps"]
         if not named or not layer.affine or state["_modules"]:
             raise TypeError("a BatchRenorm1d has other parameters or statistics than SB3-Contrib's")
+        if "train" in state:
+            raise TypeError("a BatchRenorm1d has a replaced train method, which may keep it in one mode")
         (scale, bias), (mean, variance, _) = parameters.values(), statistics.values()
         for tensor in (scale, bias):
-            check_parameter(tensor, nn.Parameter)
+            check_parameter(tensor)
         for tensor in (mean, variance):
             check_parameter(tensor, th.Tensor)
         self.layer, self._tensors = layer, (mean, variance, scale, bias)

@@ -16,7 +16,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_mcbs.networks.gradient_steps import GradientSteps, checked_switch
 from sb3_mcbs.networks.mlp import MLP
-from sb3_mcbs.networks.plain_networks import critic_mlps
+from sb3_mcbs.networks.plain_networks import check_used_once, critic_mlps
 from sb3_mcbs.networks.soft_update import SoftUpdate
 from sb3_mcbs.networks.squashed_gaussian import Sampled, SquashedGaussian
 from sb3_mcbs.networks.update import Losses, pairs_of
@@ -47,6 +47,7 @@ class CrossQUpdate(SoftUpdate):
         super().__init__(agent)
         self._critics = critic_mlps(agent.critic)
         self._gaussian = SquashedGaussian(agent.actor)
+        check_used_once([*self._critics, *self._gaussian.mlps])
 
     def next_kind(self, number: int) -> _Kind:
         """Count the gradient step.
@@ -55,6 +56,9 @@ class CrossQUpdate(SoftUpdate):
         """
         agent = self._agent
         agent._n_updates += 1
+        for mlp in (*self._critics, self._gaussian.latent):
+            for renormalization in mlp.renormalizations:
+                renormalization.layer.training = False  # as SB3-Contrib leaves it
         with_actor = agent._n_updates % agent.policy_delay == 0
         critics = tuple(map(self._past_warmup, self._critics))
         return _Kind(with_actor, critics, self._past_warmup(self._gaussian.latent) if with_actor else ())
@@ -88,7 +92,7 @@ class CrossQUpdate(SoftUpdate):
         :param past_warmup: see :meth:`~sb3_mcbs.networks.mlp.MLP.run`.
         """
         shape = observations.shape[1], self._gaussian.act_dim
-        noise = th.empty(shape, device=observations.device).normal_().t()
+        noise = observations.new_empty(shape).normal_().t()
         return self._gaussian.sample(observations, noise, past_warmup)
 
     def _update_critics(
@@ -147,7 +151,7 @@ class CrossQUpdate(SoftUpdate):
         values, lowest = th.cat([run.output for run in runs]).min(dim=0)
         gradients = []
         for number, (critic, run) in enumerate(zip(self._critics, runs, strict=True)):
-            gradient = th.where(lowest == number, -1 / len(values), 0.0).unsqueeze(0)
+            gradient = (lowest == number).to(values.dtype).div_(-len(values)).unsqueeze(0)
             gradients.append(critic.backward(run, gradient, of_input=True))
         n_actions = get_action_dim(self._agent.action_space)
         return values, functools.reduce(th.add, gradients)[-n_actions:]

@@ -1,5 +1,6 @@
 """The mixin of agents whose gradient steps are not SB3's own where they need not be."""
 
+import inspect
 import logging
 from abc import abstractmethod
 from collections.abc import Callable, Collection
@@ -77,13 +78,15 @@ class GradientSteps(OffPolicyAlgorithm):
             if self.verbose >= 1:
                 print(message)
 
-    def train(self, gradient_steps: int, batch_size: int = 100) -> None:
+    def train(self, gradient_steps: int, batch_size: int | None = None) -> None:
         """
         Update the networks as SB3 does.
 
         :param gradient_steps: how many gradient steps to do
-        :param batch_size: transitions sampled for each
+        :param batch_size: transitions sampled for each (None: SB3's default)
         """
+        if batch_size is None:
+            batch_size = inspect.signature(type(self)._sb3s_train).parameters["batch_size"].default
         update = self._present_update()
         if update is not None and self._in_graphs:
             try:

@@ -170,15 +170,12 @@ class MLP:
 
     @property
     def parameters(self) -> list[nn.Parameter]:
-        """In the order of the layers.
-
-        :raises TypeError: if there are layers that :meth:`backward` does not cover.
-        """
+        """In the order of the layers."""
         found = []
         for layer in self._layers:
             if isinstance(layer, Renormalization):
-                raise TypeError("BatchRenorm1d is trained on the statistics of batches")
-            if isinstance(layer, _Linear):
+                found += [layer.layer.scale, layer.layer.bias]
+            elif isinstance(layer, _Linear):
                 found.append(layer.weight)
                 if layer.bias is not None:
                     found.append(layer.bias)
@@ -208,7 +205,9 @@ class MLP:
         """
         inputs: list[th.Tensor] = []
         kept: list[Normalized] = []
-        for layer in self._layers:
+        for before, layer in zip([None, *self._layers], self._layers, strict=False):
+            if isinstance(before, type) and isinstance(layer, type):
+                x = x.clone()  # an activation overwrites its input, and the one before needs its output
             inputs.append(x)
             if isinstance(layer, Renormalization):
                 past = None if past_warmup is None else past_warmup[len(kept)]

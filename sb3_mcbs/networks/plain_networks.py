@@ -43,7 +43,7 @@ _LAYERS = (
 
 _METHODS = {
     cls: frozenset(name for name in dir(cls) if callable(getattr(cls, name)))
-    for cls in (*_NETWORKS, th.optim.Adam)
+    for cls in (*_NETWORKS, SquashedDiagGaussianDistribution, th.optim.Adam)
 }
 #: What calling a network calls; a user may replace it.
 _CALLED = [
@@ -127,6 +127,8 @@ def actor_mlp(actor: Any) -> MLP:
     if type(actor) is TD3Actor:
         return MLP(modules.get("mu"))
     if type(actor) in _STOCHASTIC_ACTORS and type(actor.action_dist) is SquashedDiagGaussianDistribution:
+        if not _METHODS[SquashedDiagGaussianDistribution].isdisjoint(vars(actor.action_dist)):
+            raise TypeError("a method of the actor's distribution was replaced")
         MLP(modules.get("log_std"))  # is called as well
         return MLP(modules.get("latent_pi"), modules.get("mu"), _TANH)
     raise TypeError(f"{type(actor).__name__} is not an actor whose mean action is an MLP")
@@ -152,14 +154,36 @@ def parameters_of(network: Any, mlps: list[MLP]) -> list[th.Tensor]:
     :param network: the actor or critic.
     :param mlps: its MLPs.
     :return: in the order of ``network.parameters()``.
-    :raises TypeError: if the network has parameters that its MLPs do not use.
+    :raises TypeError: if the network has parameters that its MLPs do not use, or batch renormalization.
     """
     state = vars(network)
     _, *called = state["_modules"].values()  # the first extracts features
     expected = state.get("q_networks", called)
     if state["_parameters"] or called != expected or len(called) != len(mlps):
         raise TypeError(f"a {type(network).__name__} has other modules than those that it calls")
+    check_one_mode(mlps)
     return [parameter for mlp in mlps for parameter in mlp.parameters]
+
+
+def check_one_mode(mlps: list[MLP]) -> None:
+    """Refuse MLPs that compute something else in training mode.
+
+    :param mlps: the MLPs.
+    :raises TypeError: if there is batch renormalization in one.
+    """
+    if any(mlp.renormalizations for mlp in mlps):
+        raise TypeError("there is batch renormalization, which has two modes")
+
+
+def check_used_once(mlps: list[MLP]) -> None:
+    """Refuse MLPs whose gradients must be added up, which :meth:`MLP.backward` does not do.
+
+    :param mlps: all that are trained.
+    :raises TypeError: if a parameter is in two layers or in two of the MLPs.
+    """
+    used = [id(parameter) for mlp in mlps for parameter in mlp.parameters]
+    if len({*used}) != len(used):
+        raise TypeError("a parameter is used twice")
 
 
 def all_parameters(network: Any) -> list[th.Tensor]:

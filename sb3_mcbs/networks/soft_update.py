@@ -10,11 +10,16 @@ from typing import Any
 import torch as th
 from sb3_contrib import TQC
 from sb3_contrib.common.utils import quantile_huber_loss
+from sb3_contrib.crossq import policies as crossq_policies
+from sb3_contrib.crossq.policies import Actor as CrossQActor
 from sb3_contrib.tqc import tqc as tqc_module
+from sb3_contrib.tqc.policies import Actor as TQCActor
 from stable_baselines3 import SAC
+from stable_baselines3.common import distributions
 from stable_baselines3.common.distributions import DiagGaussianDistribution, SquashedDiagGaussianDistribution
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.sac import sac as sac_module
+from stable_baselines3.sac.policies import Actor as SACActor
 from torch.nn import functional as F
 
 from sb3_mcbs.networks.gradient_steps import GradientSteps
@@ -22,6 +27,7 @@ from sb3_mcbs.networks.mlp import MLP
 from sb3_mcbs.networks.plain_networks import (
     actor_mlp,
     all_parameters,
+    check_one_mode,
     check_trained,
     check_unreplaced,
     critic_mlps,
@@ -29,7 +35,7 @@ from sb3_mcbs.networks.plain_networks import (
 from sb3_mcbs.networks.squashed_gaussian import LOG_SQRT_TWO_PI
 from sb3_mcbs.networks.update import Losses, Update
 
-#: What the ``train`` methods call besides networks and optimizers; a user may replace it.
+#: What the ``train`` methods use besides networks and optimizers; a user may replace it.
 _CALLED = [
     (owner, name, getattr(owner, name))
     for owner, name in (
@@ -38,7 +44,15 @@ _CALLED = [
         (tqc_module, "polyak_update"),
         (tqc_module, "quantile_huber_loss"),
         *((DiagGaussianDistribution, name) for name in ("proba_distribution", "log_prob", "sample")),
+        *(
+            (SquashedDiagGaussianDistribution, name)
+            for name in ("actions_from_params", "get_actions", "log_prob_from_params")
+        ),
         *((SquashedDiagGaussianDistribution, name) for name in ("proba_distribution", "log_prob", "sample")),
+        (distributions, "sum_independent_dims"),
+        *((actor, "action_log_prob") for actor in (SACActor, TQCActor, CrossQActor)),
+        (crossq_policies, "LOG_STD_MIN"),
+        (crossq_policies, "LOG_STD_MAX"),
     )
 ]
 
@@ -135,8 +149,7 @@ class SACUpdate(SoftUpdate):
 
     def __init__(self, agent: SAC | TQC) -> None:
         super().__init__(agent)
-        if any(mlp.renormalizations for mlp in self._mlps):
-            raise TypeError("there is batch renormalization, which has two modes")
+        check_one_mode(self._mlps)
         self._critics = all_parameters(agent.critic)
         self._critic_targets = all_parameters(agent.critic_target)
         self._mlps += critic_mlps(agent.critic_target)

@@ -37,7 +37,7 @@ class SquashedGaussian:
     """An actor whose layers are those of an :class:`MLP`, to be called without autograd.
 
     :param actor: of SAC, TQC or CrossQ.
-    :raises TypeError: if it is more than MLPs, or uses gSDE.
+    :raises TypeError: if it is more than MLPs, uses gSDE, or normalizes behind the latent layers.
 
     :ivar act_dim: dimensions of an action.
     :ivar latent: the layers below mean and standard deviation.
@@ -48,6 +48,13 @@ class SquashedGaussian:
         self._epsilon: float = actor.action_dist.epsilon
         self.act_dim: int = actor.action_dist.action_dim
         self.latent, self._mean, self._log_std = MLP(actor.latent_pi), MLP(actor.mu), MLP(actor.log_std)
+        if self._mean.renormalizations or self._log_std.renormalizations:
+            raise TypeError("the layers of mean and standard deviation contain batch renormalization")
+
+    @property
+    def mlps(self) -> list[MLP]:
+        """All that is trained."""
+        return [self.latent, self._mean, self._log_std]
 
     def sample(
         self, observations: th.Tensor, noise: th.Tensor, past_warmup: tuple[bool, ...] | None = None

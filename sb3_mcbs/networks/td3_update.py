@@ -22,6 +22,7 @@ from sb3_mcbs.networks.plain_networks import (
     actor_mlp,
     check_trained,
     check_unreplaced,
+    check_used_once,
     critic_mlps,
     parameters_of,
 )
@@ -47,8 +48,7 @@ class TD3Update(Update):
         critic_target = parameters_of(agent.critic_target, self._critic_targets)
         check_trained(agent.actor.optimizer, actor)
         check_trained(agent.critic.optimizer, critic)
-        if len({*map(id, actor), *map(id, critic)}) != len(actor) + len(critic):
-            raise TypeError("a parameter is used twice")
+        check_used_once([self._actor, *self._critics])
         self._targets_and_networks = [(critic_target, critic), (actor_target, actor)]
         if len(actor_target) != len(actor) or len(critic_target) != len(critic):
             raise TypeError("a target network is of another shape than its network")
