@@ -19,7 +19,7 @@ from benchmarks import NETWORKS
 WARM_UP = 400
 SIZES = {"MCBSTD3 (6,3,5)": (6, 3, 5), "MCBSTD3 (6,3,1)": (6, 3, 1), "MCBSTD3 (18,6,5)": (18, 6, 5)}
 #: ``mcbs_td3.yml`` in HalfCheetah, but searching in half of the steps, not of the episodes: rounds are short.
-RECIPE: dict[str, Any] = {"preset": "efficient", "search_share": 0.5, "value_expansion": 2}
+RECIPE: dict[str, Any] = {"preset": "train", "search_unit": "step", "policy_delay": 1}
 
 
 def settings(n_envs: int) -> dict[str, Any]:
