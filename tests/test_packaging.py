@@ -74,6 +74,7 @@ def test_page_of_versions_names_the_bounds_and_the_pins(pins: dict[str, str]) ->
         "Stable-Baselines3, SB3-Contrib": "stable-baselines3",
         "Gymnasium": "gymnasium",
         "MuJoCo": "mujoco",
+        "NumPy": "numpy",
         "Numba": "numba",
         "RL Zoo (extra `zoo`)": "rl-zoo3",
         "Optuna (extra `zoo`)": "optuna",
