@@ -312,7 +312,7 @@ def test_a_preset_replaces_what_the_file_says_of_the_search(
     agent = MCBSTD3.load(folder / "HalfCheetah-v5.zip")
     assert agent.search_settings == SearchSettings.preset(preset, model_kwargs=dict(n_threads=1))
     training = agent.search_share, agent.search_unit, agent.value_expansion, agent.branch_length
-    of_file = 0.5, "episode", 2, 0
+    of_file = 0.5, "episode", 2, 20
     of_presets = {"paper": (1, "step", 0, 0), "train": (0.5, "episode", 2, 20)}
     assert training == of_presets.get(preset, of_file), "the others leave it to the file when to search"
 

@@ -31,11 +31,10 @@ def recipe(findings: dict[str, Any], name: str, wrappers: list[str], exact: bool
     known = yaml.safe_load(hyperparams_path(algo).read_text())
     module, _, function = name.rpartition(":")
     env_id = f"{findings['environment']['class']}-v0" if is_file(name) else function
-    command = f"python -m rl_zoo3.train --algo {algo} --env {env_id} -conf doctor.yml"
-    lines = [f"# {command}" + (" \\" if module else "")]
+    options = "-conf doctor.yml"
     if module:
-        package = Path(module).stem if is_file(name) else module
-        lines.append(f"#     --gym-packages {package}")
+        options += f" --gym-packages {Path(module).stem if is_file(name) else module}"
+    lines = [f"# python -m rl_zoo3.train --algo {algo} --env {env_id} \\", f"#     {options}"]
     if is_file(name):
         lines += [
             "# RL Zoo finds environments by their id. Give yours one at the end of the file:",
