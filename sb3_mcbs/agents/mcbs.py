@@ -161,7 +161,7 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
             exchanged = self.planner.follow(settings)
             self._check_states()
             self._expand_buffer()
-            if self._expansion_has_changed() or exchanged:
+            if self._note_expansion() or exchanged:
                 self._say_what_simulates()
         self._remember_actions(settings)
         assert self._schedule is not None
@@ -186,7 +186,7 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
         self.planner = Planner(self, env, settings, normalize_reward, self.recent_actions)
         try:
             self._check_states()
-            self._expansion_has_changed()
+            self._note_expansion()
             self._expand_buffer()
         except Exception:
             self.planner.close()

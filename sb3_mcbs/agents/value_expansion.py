@@ -161,8 +161,11 @@ class Expanding(CheckedRollouts):
             if isinstance(self.replay_buffer, ExpandedReplayBuffer):
                 make_room(self.replay_buffer, state_size)
 
-    def _expansion_has_changed(self) -> bool:
-        """Whether value expansion was switched on or off since the last call, or may now be left out."""
+    def _note_expansion(self) -> bool:
+        """Note whether there is value expansion, and drop branches that are not continued.
+
+        :return: whether it was switched on or off since the last call, or may now be left out.
+        """
         if not self.branch_length:
             self.branches = None  # later they would be those of an old actor
         before, now = self._known_expansion, (self.value_expansion > 0, bool(self.expansion_where_possible))

@@ -11,12 +11,11 @@ from typing import Any, NamedTuple
 
 import torch as th
 from sb3_contrib import CrossQ
-from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
-from sb3_mcbs.networks.gradient_steps import GradientSteps, checked_switch
+from sb3_mcbs.networks.gradient_steps import FastGradientSteps
 from sb3_mcbs.networks.mlp import MLP
-from sb3_mcbs.networks.plain_networks import check_used_once, critic_mlps
+from sb3_mcbs.networks.plain_networks import check_used_once
 from sb3_mcbs.networks.soft_update import SoftUpdate
 from sb3_mcbs.networks.squashed_gaussian import Sampled, SquashedGaussian
 from sb3_mcbs.networks.update import Losses, pairs_of
@@ -45,9 +44,8 @@ class CrossQUpdate(SoftUpdate):
 
     def __init__(self, agent: CrossQ) -> None:
         super().__init__(agent)
-        self._critics = critic_mlps(agent.critic)
         self._gaussian = SquashedGaussian(agent.actor)
-        check_used_once([*self._critics, *self._gaussian.mlps])
+        check_used_once([*self._critic_mlps, *self._gaussian.mlps])
 
     def next_kind(self, number: int) -> _Kind:
         """Count the gradient step.
@@ -56,11 +54,11 @@ class CrossQUpdate(SoftUpdate):
         """
         agent = self._agent
         agent._n_updates += 1
-        for mlp in (*self._critics, self._gaussian.latent):
+        for mlp in (*self._critic_mlps, self._gaussian.latent):
             for renormalization in mlp.renormalizations:
                 renormalization.layer.training = False  # as SB3-Contrib leaves it
         with_actor = agent._n_updates % agent.policy_delay == 0
-        critics = tuple(map(self._past_warmup, self._critics))
+        critics = tuple(map(self._past_warmup, self._critic_mlps))
         return _Kind(with_actor, critics, self._past_warmup(self._gaussian.latent) if with_actor else ())
 
     def _past_warmup(self, mlp: MLP) -> tuple[bool, ...]:
@@ -78,7 +76,7 @@ class CrossQUpdate(SoftUpdate):
         losses = {"ent_coef": alpha.reshape(())}
         losses["critic_loss"] = self._update_critics(data, pairs, alpha, kind.critics)
         if kind.with_actor:
-            n_obs = len(pairs) - get_action_dim(self._agent.action_space)
+            n_obs = len(pairs) - self._gaussian.act_dim
             sampled = self._draw(pairs[:n_obs], kind.actor)
             losses |= self._update_coefficient(sampled.log_prob)
             pairs[n_obs:] = sampled.actions
@@ -111,15 +109,15 @@ class CrossQUpdate(SoftUpdate):
         """
         n = len(data.actions)
         next_pairs = pairs_of(data.next_observations, data.actions)
-        n_obs = len(pairs) - get_action_dim(self._agent.action_space)
+        n_obs = len(pairs) - self._gaussian.act_dim
         sampled = self._draw(next_pairs[:n_obs])
         next_pairs[n_obs:] = sampled.actions
         both = th.cat([pairs, next_pairs], dim=1)
-        runs = [critic.run(both, past) for critic, past in zip(self._critics, past_warmup, strict=True)]
+        runs = [critic.run(both, past) for critic, past in zip(self._critic_mlps, past_warmup, strict=True)]
         next_values = th.cat([run.output[:, n:] for run in runs]).amin(dim=0).unsqueeze(1)
         targets = self._targets(data, next_values, sampled.log_prob.t(), alpha).t()
         losses = []
-        for critic, run in zip(self._critics, runs, strict=True):
+        for critic, run in zip(self._critic_mlps, runs, strict=True):
             errors = run.output[:, :n] - targets
             losses.append(0.5 * errors.square().mean())
             gradient = th.zeros_like(run.output)
@@ -147,28 +145,19 @@ class CrossQUpdate(SoftUpdate):
         :param pairs: ``[obs_dim + act_dim, batch]``.
         :return: these values ``[batch]``, and the gradient with respect to the actions ``[act_dim, batch]``.
         """
-        runs = [critic.run(pairs) for critic in self._critics]
+        runs = [critic.run(pairs) for critic in self._critic_mlps]
         values, lowest = th.cat([run.output for run in runs]).min(dim=0)
         gradients = []
-        for number, (critic, run) in enumerate(zip(self._critics, runs, strict=True)):
+        for number, (critic, run) in enumerate(zip(self._critic_mlps, runs, strict=True)):
             gradient = (lowest == number).to(values.dtype).div_(-len(values)).unsqueeze(0)
             gradients.append(critic.backward(run, gradient, of_input=True))
-        n_actions = get_action_dim(self._agent.action_space)
-        return values, functools.reduce(th.add, gradients)[-n_actions:]
+        return values, functools.reduce(th.add, gradients)[-self._gaussian.act_dim :]
 
 
-class CrossQSteps(GradientSteps, CrossQ):
-    """CrossQ, or a subclass of it, whose gradient steps are those of :class:`CrossQUpdate` where they can be.
+class CrossQSteps(FastGradientSteps, CrossQ):
+    """CrossQ, or a subclass, whose gradient steps are those of :class:`CrossQUpdate` where they can be."""
 
-    A subclass's constructor sets :attr:`fast_update` before the networks are set up.
-    """
-
-    #: ``False`` leaves gradient steps to SB3-Contrib.
-    fast_update: bool
     _sb3s_train = CrossQ.train
-
-    def _wants_update(self) -> bool:
-        return checked_switch(self, "fast_update")
 
     def _make_update(self) -> CrossQUpdate:
         return CrossQUpdate(self)

@@ -123,6 +123,19 @@ class GradientSteps(OffPolicyAlgorithm):
         return [*super()._excluded_save_params(), *GradientSteps.not_checkpointed]
 
 
+class FastGradientSteps(GradientSteps):
+    """An agent whose gradient steps are those of an :class:`Update` on a CPU too, where it covers the agent.
+
+    A subclass's constructor sets :attr:`fast_update` before the networks are set up.
+    """
+
+    #: ``False`` leaves gradient steps to SB3.
+    fast_update: bool
+
+    def _wants_update(self) -> bool:
+        return checked_switch(self, "fast_update")
+
+
 def checked_switch(agent: Any, name: str) -> bool:
     """Read a setting that is True or False.
 

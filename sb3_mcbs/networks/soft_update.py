@@ -73,7 +73,8 @@ class SoftUpdate(Update):
         learned = agent.ent_coef_optimizer
         optimizers = [agent.actor.optimizer, agent.critic.optimizer]
         super().__init__(agent, optimizers if learned is None else [*optimizers, learned])
-        self._mlps = [actor_mlp(agent.actor), MLP(agent.actor.log_std), *critic_mlps(agent.critic)]
+        self._critic_mlps = critic_mlps(agent.critic)
+        self._mlps = [actor_mlp(agent.actor), MLP(agent.actor.log_std), *self._critic_mlps]
         check_trained(agent.actor.optimizer, all_parameters(agent.actor))
         check_trained(agent.critic.optimizer, all_parameters(agent.critic))
         if learned is not None:

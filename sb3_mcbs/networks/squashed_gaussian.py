@@ -7,7 +7,6 @@ import torch as th
 from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN
 
 from sb3_mcbs.networks.mlp import MLP, Pass
-from sb3_mcbs.networks.plain_networks import actor_mlp
 
 LOG_SQRT_TWO_PI = math.log(math.sqrt(2 * math.pi))
 
@@ -36,15 +35,14 @@ class Sampled(NamedTuple):
 class SquashedGaussian:
     """An actor whose layers are those of an :class:`MLP`, to be called without autograd.
 
-    :param actor: of SAC, TQC or CrossQ.
-    :raises TypeError: if it is more than MLPs, uses gSDE, or normalizes behind the latent layers.
+    :param actor: of SAC, TQC or CrossQ, of which :func:`~.plain_networks.actor_mlp` can be made.
+    :raises TypeError: if it normalizes behind the latent layers, or has none.
 
     :ivar act_dim: dimensions of an action.
     :ivar latent: the layers below mean and standard deviation.
     """
 
     def __init__(self, actor: Any) -> None:
-        actor_mlp(actor)  # refuses what is not covered
         self._epsilon: float = actor.action_dist.epsilon
         self.act_dim: int = actor.action_dist.action_dim
         self.latent, self._mean, self._log_std = MLP(actor.latent_pi), MLP(actor.mu), MLP(actor.log_std)

@@ -17,7 +17,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.td3 import td3 as td3_module
 from torch.nn import functional as F
 
-from sb3_mcbs.networks.gradient_steps import GradientSteps, checked_switch
+from sb3_mcbs.networks.gradient_steps import FastGradientSteps
 from sb3_mcbs.networks.plain_networks import (
     actor_mlp,
     check_trained,
@@ -154,19 +154,10 @@ _CALLED = [
 ]
 
 
-class FastUpdate(GradientSteps, TD3):
-    """
-    TD3, or a subclass of it, whose gradient steps are those of :class:`TD3Update` where they can be.
+class FastUpdate(FastGradientSteps, TD3):
+    """TD3, or a subclass of it, whose gradient steps are those of :class:`TD3Update` where they can be."""
 
-    A subclass's constructor sets :attr:`fast_update` before the networks are set up.
-    """
-
-    #: ``False`` leaves gradient steps to SB3.
-    fast_update: bool
     _sb3s_train = TD3.train
-
-    def _wants_update(self) -> bool:
-        return checked_switch(self, "fast_update")
 
     def _make_update(self) -> TD3Update:
         check_unreplaced(_CALLED)
