@@ -14,6 +14,7 @@ from sb3_mcbs.agents.compiled_policy import CompiledPolicy
 from sb3_mcbs.agents.expanded_buffer import ExpandedReplayBuffer
 from sb3_mcbs.agents.planner import Planner
 from sb3_mcbs.models.compiled_networks import actions_of, values_of
+from sb3_mcbs.networks import mlp
 from sb3_mcbs.networks.functions import policy_function, value_function
 from sb3_mcbs.search import BeamSettings, CEMSettings, Roots, search
 
@@ -110,6 +111,27 @@ def test_only_the_rollout_that_diverges_is_invalid(tmp_path, monkeypatch) -> Non
     np.testing.assert_array_equal(found.valid, expected)
     np.testing.assert_array_equal(found.returns[expected], undisturbed.returns[expected])
     assert found.lengths.tolist() == [[3, 3], [3, 3], [3, 2], [3, 3]]
+
+
+@pytest.mark.parametrize("cls", [MCBSTD3, MCBSCrossQ])
+def test_copies_of_networks_on_a_gpu_give_the_same(cls: type, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Here the networks are on the CPU and taken for others."""
+    planner = make_planner(SETTINGS["paper"], "HalfCheetah-v5", cls=cls, normalized=True)
+    roots, generator = roots_of(planner), np.random.default_rng
+    own = search(roots, planner.functions(), SETTINGS["paper"], generator(0))
+    monkeypatch.setattr(mlp, "_is_host", lambda device: False)
+    copied = planner.functions()
+    addresses = {array.data_ptr() for array in planner.agent.policy.state_dict().values()}
+    tables = copied.rollout.__self__._arrays
+    used = {*tables.actor[:, :4].ravel().tolist(), *tables.critics[:, :, :4].ravel().tolist()}
+    assert len(used) > 10 and not used & addresses
+    found = search(roots, copied, SETTINGS["paper"], generator(0))
+    assert found.values.tobytes() == own.values.tobytes()
+    with th.no_grad():
+        for parameter in planner.agent.actor.parameters():
+            parameter *= 0.5
+    after = search(roots, planner.functions(), SETTINGS["paper"], generator(0))
+    assert not np.array_equal(after.values, own.values)
 
 
 def test_weights_that_change_are_seen() -> None:

@@ -107,6 +107,18 @@ def test_a_search_trains_beside_the_graphs(value_expansion):
     assert np.isfinite(action).all()
 
 
+def test_rollouts_are_compiled_and_those_of_the_cpu(tmp_path):
+    agent = make_searching(None)
+    agent.learn(40)
+    agent.save(tmp_path / "agent")
+    on_cpu = MCBSTD3.load(tmp_path / "agent", agent.env, device="cpu")
+    decisions = []
+    for each in (agent, on_cpu):
+        assert "rollouts are compiled" in each.planner.description
+        decisions.append(each.planner.plan(agent._last_obs, np.random.default_rng(0)))
+    np.testing.assert_allclose(decisions[0].values, decisions[1].values, rtol=1e-6)
+
+
 def test_a_resumed_run_says_that_it_is_not_exact(tmp_path):
     crash(make_searching, tmp_path, 120, 100)
     agent = resume(tmp_path / "checkpoints")

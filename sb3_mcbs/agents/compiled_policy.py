@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import torch as th
 from sb3_contrib import TQC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
@@ -12,7 +13,7 @@ from sb3_mcbs.agents.observation_pipeline import EnvironmentPipeline, Observatio
 from sb3_mcbs.models import MujocoBatchModel
 from sb3_mcbs.models.compiled_networks import actions_of, values_of
 from sb3_mcbs.networks.functions import actor_of, unscales_as_sb3
-from sb3_mcbs.networks.mlp import MLP
+from sb3_mcbs.networks.mlp import MLP, tables
 from sb3_mcbs.networks.plain_networks import actor_mlp, critic_mlps
 from sb3_mcbs.types import ForwardModel, PolicyArrays, PolicyRollouts
 
@@ -34,10 +35,11 @@ class CompiledPolicy:
     ) -> None:
         if not isinstance(model, MujocoBatchModel):
             raise TypeError(f"the forward model is {model.kind!r}, not 'mujoco'")
-        #: The tables are valid as long as these live.
-        self._networks = actor_mlp(actor_of(agent, target)), critic_mlps(agent.policy.critic)
         self._model, self._view = model, view
-        self._arrays = policy_arrays(agent, view, *self._networks)
+        #: The arrays are valid as long as the weights live.
+        self._arrays, self._weights = policy_arrays(
+            agent, view, actor_mlp(actor_of(agent, target)), critic_mlps(agent.policy.critic)
+        )
 
     def policy(self, observations: Any) -> np.ndarray:
         """The actor's actions ``[rows, act_dim]`` for observations of the environment."""
@@ -91,13 +93,16 @@ def _rows(observations: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(observations, dtype=np.float64)
 
 
-def policy_arrays(agent: Any, view: ObservationPipeline, actor: MLP, critics: list[MLP]) -> PolicyArrays:
+def policy_arrays(
+    agent: Any, view: ObservationPipeline, actor: MLP, critics: list[MLP]
+) -> tuple[PolicyArrays, list[th.Tensor]]:
     """An agent's networks and pipeline as arrays.
 
     :param agent: a supported agent.
     :param view: turns simulated observations and rewards into those of the networks.
     :param actor: the actor.
     :param critics: the critics.
+    :return: the arrays, and the weights behind their addresses.
     :raises TypeError: says what compiled code does not cover.
     """
     if not unscales_as_sb3(agent):
@@ -107,9 +112,10 @@ def policy_arrays(agent: Any, view: ObservationPipeline, actor: MLP, critics: li
     if normalizer is not None:
         scale = float(np.sqrt(normalizer.ret_rms.var + normalizer.epsilon))
         reward_clip = float(normalizer.clip_reward)
-    return PolicyArrays(
-        actor.table(),
-        np.stack([critic.table() for critic in critics]),
+    (actor_table, *critic_tables), weights = tables([actor, *critics])
+    arrays = PolicyArrays(
+        actor_table,
+        np.stack(critic_tables),
         isinstance(agent, TQC),
         *_observation_scale(view),
         space.low.ravel(),
@@ -118,6 +124,7 @@ def policy_arrays(agent: Any, view: ObservationPipeline, actor: MLP, critics: li
         reward_clip,
         float(agent.gamma),
     )
+    return arrays, weights
 
 
 def _observation_scale(view: ObservationPipeline) -> tuple[np.ndarray, np.ndarray, float]:

@@ -99,7 +99,6 @@ class MLP:
 
     def __init__(self, *modules: nn.Module) -> None:
         self._layers: list[_Linear | Renormalization | type[nn.Module]] = []
-        self._behind_addresses: list[th.Tensor] = []
         for module in modules:
             self._append(module)
         if not self._layers:
@@ -138,35 +137,31 @@ class MLP:
         """The layers' addresses and constants: MLPs of the same signature compute the same."""
         return tuple(layer if isinstance(layer, type) else layer.signature for layer in self._layers)
 
-    def table(self) -> np.ndarray:
-        """The layers for compiled code, which are valid as long as this object lives.
+    def rows(self) -> list[tuple[list[th.Tensor | None], int]]:
+        """The layers as :func:`tables` lists them.
 
-        :return: ``[layers, 7]`` int64, see :class:`~sb3_mcbs.types.Layer`.
-        :raises TypeError: if they lie on a GPU, or are not linear layers with at most one normalization
-            before and one activation after each.
+        :return: for each linear layer, gain, shift, weight and bias, and the activation of its output.
+        :raises TypeError: if they are not linear layers with at most one normalization before and one
+            activation after each.
         """
-        if self.device.type != "cpu":
-            raise TypeError("the networks are not on the CPU")
-        table: list[list[int]] = []
-        before = [0, 0]
+        rows: list[tuple[list[th.Tensor | None], int]] = []
+        before: list[th.Tensor | None] = [None, None]
         for layer in self._layers:
-            if isinstance(layer, Renormalization) and not any(before):
-                self._behind_addresses += (factors := layer.factors())
-                before = [factor.data_ptr() for factor in factors]
+            if isinstance(layer, Renormalization) and before[0] is None:
+                before = [*layer.factors()]
             elif isinstance(layer, _Linear):
                 bias = layer.bias
                 if bias is None:
-                    self._behind_addresses.append(bias := th.zeros(len(layer.weight)))
-                n_out, n_in = layer.weight.shape
-                table.append([*before, layer.weight.data_ptr(), bias.data_ptr(), n_in, n_out, 0])
-                before = [0, 0]
-            elif not isinstance(layer, Renormalization) and not any(before) and not table[-1][-1]:
-                table[-1][-1] = _ACTIVATIONS[layer]
+                    bias = th.zeros(len(layer.weight), device=layer.device)
+                rows.append(([*before, layer.weight, bias], 0))
+                before = [None, None]
+            elif not isinstance(layer, Renormalization) and before[0] is None and not rows[-1][1]:
+                rows[-1] = rows[-1][0], _ACTIVATIONS[layer]
             else:
                 raise TypeError("layers follow each other in an order that compiled code does not know")
-        if any(before):
+        if before[0] is not None:
             raise TypeError("a normalization is the last layer")
-        return np.array(table, dtype=np.int64)
+        return rows
 
     @property
     def parameters(self) -> list[nn.Parameter]:
@@ -247,3 +242,38 @@ class MLP:
 
 def _activate(activation: type[nn.Module], x: th.Tensor) -> th.Tensor:
     return x.relu_() if activation is nn.ReLU else x.tanh_()
+
+
+def tables(mlps: Sequence[MLP]) -> tuple[list[np.ndarray], list[th.Tensor]]:
+    """Networks for compiled code, which reads their present weights, or copies of these from a GPU.
+
+    :param mlps: networks on the same device.
+    :return: for each, ``[layers, 7]`` int64, see :class:`~sb3_mcbs.types.Layer`; and what lies behind the
+        addresses: the tables are valid as long as it lives.
+    :raises TypeError: if compiled code does not cover the order of their layers.
+    """
+    rows = [mlp.rows() for mlp in mlps]
+    arrays = [array for layers in rows for layer, _ in layers for array in layer if array is not None]
+    if not _is_host(mlps[0].device):
+        arrays = _copied_to_host(arrays)
+    addresses = iter([array.data_ptr() for array in arrays])
+    found = []
+    for layers in rows:
+        table = []
+        for layer, activation in layers:
+            n_out, n_in = layer[2].shape  # type: ignore[union-attr]
+            entry = [0 if array is None else next(addresses) for array in layer]
+            table.append([*entry, n_in, n_out, activation])
+        found.append(np.array(table, dtype=np.int64))
+    return found, arrays
+
+
+def _is_host(device: th.device) -> bool:
+    return device.type == "cpu"
+
+
+def _copied_to_host(arrays: list[th.Tensor]) -> list[th.Tensor]:
+    """Copy arrays from a GPU in one piece, since each copy waits for it."""
+    with th.no_grad():
+        flat = th.cat([array.reshape(-1) for array in arrays]).cpu()
+    return list(flat.split([array.numel() for array in arrays]))
