@@ -35,7 +35,10 @@ from sb3_mcbs.snapshot import SnapshotEnvWrapper, SnapshotUnsupportedError
 from sb3_mcbs.snapshot.object_graph import Capture, Restore
 
 #: On whose versions it depends what a run computes.
-_PACKAGES = ("numpy", "torch", "gymnasium", "stable-baselines3", "sb3-contrib", "mujoco", "sb3-mcbs")
+_PACKAGES = (
+    "numpy", "torch", "numba", "llvmlite",
+    "gymnasium", "stable-baselines3", "sb3-contrib", "mujoco", "sb3-mcbs",
+)  # fmt: skip
 #: Parameters of constructors that are kept under another name.
 _ATTRIBUTES = {"policy": "policy_class", "stats_window_size": "_stats_window_size"}
 _NOT_SETTINGS = ("self", "env", "_init_setup_model")
