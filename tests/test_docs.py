@@ -288,7 +288,7 @@ def test_the_page_of_settings_has_all_with_their_defaults() -> None:
         "cuda_graphs": True,
     }
     assert set(search) == {*KEYWORDS, "preset"}
-    assert known_by(search, "`SearchPolicy`") == set(search)
+    assert set(inspect.signature(SearchPolicy).parameters) >= set(search)
     assert defaults_of(table_of("search_kwargs")) == field_defaults(BeamSettings, TreeSettings, CEMSettings)
     assert defaults_of(table_of("schedule_kwargs")) == field_defaults(ScheduleSettings)
     assert defaults_of(table_of("model_kwargs")) == {"n_threads": 0, **field_defaults(EnsembleSettings)}
