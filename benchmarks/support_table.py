@@ -146,7 +146,7 @@ def _measured(found: dict[str, Any]) -> list[Any]:
     return [
         adapter,
         kind if model["deterministic"] else f"{kind}, random steps",
-        f"yes ({snapshot['steps_compared']} steps)",
+        f"{snapshot['steps_compared']} steps",
         cost.get("milliseconds", "too slow"),
     ]
 
