@@ -22,7 +22,7 @@ from sb3_mcbs.doctor.report import block
 #: Seconds that a stage of the examination may take.
 LIMIT = 180.0
 FACTORIES = f"{Path(__file__).with_name('support_envs.py')}:"
-HEADER = ("environment", "adapter", "forward model", "exact", "ms per decision at (6, 3, 5)", "set")
+HEADER = ("environment", "adapter", "forward model", "exact", "ms per decision", "set")
 #: The lines of the page between which the table stands.
 BEGIN, END = "<!-- support table -->", "<!-- end of the support table -->"
 #: The adapters' names in the table.
@@ -52,7 +52,7 @@ class Row(NamedTuple):
     also: str = ""
 
 
-_HER = "`replay_buffer_class: HerReplayBuffer`"
+_HER = "`HerReplayBuffer`"
 ROWS = (
     Row("HalfCheetah-v5"),
     Row("Humanoid-v5"),
@@ -146,7 +146,7 @@ def _measured(found: dict[str, Any]) -> list[Any]:
     return [
         adapter,
         kind if model["deterministic"] else f"{kind}, random steps",
-        f"yes ({snapshot['steps_compared']} steps)",
+        f"{snapshot['steps_compared']} steps",
         cost.get("milliseconds", "too slow"),
     ]
 

@@ -3,6 +3,17 @@
 All use a :class:`~tests.reference_search.Reference` as the simulator of one environment: its ``restore``,
 ``env_step``, ``policy``, ``critics`` and ``gamma``. Every simulation starts at the root again and repeats its
 actions. A step whose reward is NaN has diverged. Random numbers are handed in.
+
+All noise of a decision (with ``time_budget``: of a round) is drawn from the search's generator before the
+simulation, as float32, in this order:
+
+- beam: candidates ``[n_envs, proposals, act_dim]``, later actions ``[D, n_envs, B, n_simulations, act_dim]``;
+- tree: root actions ``[n_envs, 1, proposals, act_dim]``, later actions
+  ``[D - 1, n_envs, B, proposals / B, act_dim]``;
+- cem: ``[R, n_envs, proposals, D, act_dim]``.
+
+``proposals`` is ``n_proposals``, or else the number that is simulated: ``B``, for a tree ``B * K``.
+``antithetic`` draws half of a paired axis.
 """
 
 import math

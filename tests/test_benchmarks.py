@@ -177,8 +177,8 @@ def test_the_support_table_names_what_is_missing_and_what_fails(monkeypatch, tmp
     assert examined == ["Fetch-v4", "Other-v0", "Bad-v0"]
     text = page.read_text()
     assert text.startswith("Before\n") and text.endswith("after\n") and "old" not in text
-    assert "| `Fetch-v4` | MuJoCo | copies | yes (9 steps) | 12.3 | A, `MultiInputPolicy`, HER |" in text
-    assert "| `Other-v0` | MuJoCo | copies | yes (9 steps) | 12.3 | A, `MultiInputPolicy` |" in text
+    assert "| `Fetch-v4` | MuJoCo | copies | 9 steps | 12.3 | A, `MultiInputPolicy`, HER |" in text
+    assert "| `Other-v0` | MuJoCo | copies | 9 steps | 12.3 | A, `MultiInputPolicy` |" in text
     assert "not installed: `pip install not-a-package`" in text
     assert "no: It is broken." in text
     assert "- **A** `{preset: efficient}`" in text

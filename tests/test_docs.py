@@ -247,7 +247,7 @@ def test_messages_are_those_of_the_code() -> None:
     messages = re.findall(
         r"^#+ `(.*)`$", (DOCS / "errors.md").read_text(encoding="utf-8"), flags=re.MULTILINE
     )
-    assert len(messages) > 20
+    assert len(messages) > 15
     for message in messages:
         for part in message.split("..."):
             assert part.strip() in text, message
@@ -288,7 +288,7 @@ def test_the_page_of_settings_has_all_with_their_defaults() -> None:
         "cuda_graphs": True,
     }
     assert set(search) == {*KEYWORDS, "preset"}
-    assert known_by(search, "`SearchPolicy`") == set(search)
+    assert set(inspect.signature(SearchPolicy).parameters) >= set(search)
     assert defaults_of(table_of("search_kwargs")) == field_defaults(BeamSettings, TreeSettings, CEMSettings)
     assert defaults_of(table_of("schedule_kwargs")) == field_defaults(ScheduleSettings)
     assert defaults_of(table_of("model_kwargs")) == {"n_threads": 0, **field_defaults(EnsembleSettings)}

@@ -2,10 +2,12 @@
 
 import re
 from pathlib import Path
+from typing import ClassVar
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.envs.mujoco import MujocoEnv
 from gymnasium.envs.mujoco.ant_v5 import AntEnv
 from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv
 
@@ -14,6 +16,8 @@ from sb3_mcbs.models import (
     ForwardModelError,
     LocalEnvironments,
     MujocoBatchModel,
+    families,
+    make_forward_model,
     register_family,
 )
 from sb3_mcbs.models.families import known_families
@@ -248,6 +252,62 @@ def test_the_documented_family_is_taken_and_exact(capsys: pytest.CaptureFixture)
         if terminated:
             break
     assert terminated
+
+
+MOTOR_WITH_FILTER = """
+<mujoco>
+  <worldbody>
+    <body>
+      <joint name="slider" type="slide" axis="1 0 0"/>
+      <geom size="0.1" mass="1"/>
+      <site name="tip"/>
+    </body>
+  </worldbody>
+  <actuator>
+    <general joint="slider" dyntype="filter" dynprm="0.05" gainprm="20" ctrlrange="-1 1" ctrllimited="true"/>
+  </actuator>
+  <sensor><velocimeter site="tip"/></sensor>
+</mujoco>
+"""
+
+
+class FilteredMotor(MujocoEnv):
+    """Observes the state of its actuator and a sensor."""
+
+    metadata: ClassVar = {"render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"]}
+
+    def __init__(self, xml_file: str) -> None:
+        super().__init__(xml_file, 2, gym.spaces.Box(-np.inf, np.inf, (4,), np.float64))
+
+    def step(self, action):
+        self.do_simulation(action, self.frame_skip)
+        return self._observe(), self.data.qvel[0], False, False, {}
+
+    def reset_model(self):
+        self.set_state(self.np_random.uniform(-0.1, 0.1, 1), self.init_qvel)
+        return self._observe()
+
+    def _observe(self):
+        return np.concatenate([self.data.act, self.data.sensordata])
+
+
+def test_families_may_read_actuator_states_and_sensors(tmp_path: Path, monkeypatch) -> None:
+    def transition(env, kept, data, action, observation):
+        observation[:1], observation[1:] = data.act, data.sensordata
+        return data.qvel[0], False
+
+    (tmp_path / "motor.xml").write_text(MOTOR_WITH_FILTER)
+    monkeypatch.setattr(families, "_FAMILIES", dict(families._FAMILIES))
+    register_family(FilteredMotor, Family(lambda env: {}, ("qvel", "act", "sensordata"), transition))
+    env = SnapshotEnvWrapper(FilteredMotor(str(tmp_path / "motor.xml")))
+    env.reset(seed=0)
+    model = make_forward_model(LocalEnvironments([env]), "mujoco")
+    model.set_roots(model.read_roots([0]), np.zeros(1, dtype=int), np.random.default_rng())
+    for action in np.float32([[1.0], [-0.5], [0.25]]):
+        transition_of_model = model.step(action[None])
+        observation, reward, *_ = env.step(action)
+        assert_bitwise(transition_of_model.observations[0], observation)
+        assert_bitwise(transition_of_model.rewards[0], reward)
 
 
 def test_the_documented_introduction_runs(capsys: pytest.CaptureFixture) -> None:
