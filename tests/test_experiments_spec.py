@@ -122,7 +122,7 @@ SHIPPED = {
     "ablation": 18,
     "ablation-frozen": 66,
     "search-training": 60,
-    "crossq": 35,
+    "crossq": 40,
     "crossq-100k": 40,
     "crossq-copies": 2,
     "saturation": 20,
