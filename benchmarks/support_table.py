@@ -6,6 +6,7 @@ installed, or cannot be made, is a row as well.
 
 import argparse
 import sys
+import textwrap
 from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -132,7 +133,7 @@ class Table:
             yield "| " + " | ".join(map(common.shown, row)) + " |"
         yield ""
         for text, letter in self.settings.items():
-            yield f"- **{letter}** `{text}`"
+            yield textwrap.fill(f"- **{letter}** `{text}`", 120, subsequent_indent="  ")
 
 
 def _measured(found: dict[str, Any]) -> list[Any]:
