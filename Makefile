@@ -70,7 +70,7 @@ bench-training: $(STAMP) .venv-sbx/bin/python
 .venv-support/bin/python: benchmarks/requirements-support.txt
 	$(PYTHON) -m venv .venv-support
 	grep -v mujoco constraints.txt > .venv-support/constraints.txt
-	.venv-support/bin/python -m pip install --quiet -c .venv-support/constraints.txt -e ".[zoo,box2d]" "mujoco<4"
+	.venv-support/bin/python -m pip install --quiet -c .venv-support/constraints.txt -e ".[box2d]" "mujoco<4"
 	grep -v '^#' $< | while read -r package; do \
 	    .venv-support/bin/python -m pip install --quiet -c .venv-support/constraints.txt $$package || \
 	    echo "not installed: $$package"; done

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_mcbs.experiments.machine import processor_name
+from sb3_mcbs.checkpoints.settings import processor_name
 from sb3_mcbs.models.mujoco_batch import usable_cores
 
 #: The results in the repository.

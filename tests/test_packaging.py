@@ -93,13 +93,24 @@ def test_commands_of_rl_zoo_find_what_they_import() -> None:
     assert plots >= {"rliable", "scipy", "seaborn"}
 
 
-def test_without_rl_zoo_its_commands_say_what_to_install_and_the_others_work(tmp_path: Path) -> None:
+def without_rl_zoo() -> str:
+    """Code after which nothing of the extra ``zoo`` can be imported."""
     zoo = [
         normalised(entry).replace("-", "_") for entry in METADATA["project"]["optional-dependencies"]["zoo"]
     ]
     hidden = {*zoo, "huggingface_hub", "huggingface_sb3"} - {"jinja2"}  # torch brings its own jinja2
+    return f"import sys; sys.modules.update(dict.fromkeys({sorted(hidden)}))\n"
+
+
+@pytest.mark.parametrize("name", ["check_gpu", "support_table"])
+def test_measurements_for_other_machines_need_no_rl_zoo(name: str) -> None:
+    code = f"{without_rl_zoo()}import benchmarks.{name}"
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
+
+
+def test_without_rl_zoo_its_commands_say_what_to_install_and_the_others_work(tmp_path: Path) -> None:
     code = (
-        f"import sys; sys.modules.update(dict.fromkeys({sorted(hidden)}))\n"
+        f"{without_rl_zoo()}"
         "from sb3_mcbs import cli\n"
         "for words in sys.argv[1:]:\n"
         "    sys.argv = ['sb3-mcbs', *words.split()]\n"

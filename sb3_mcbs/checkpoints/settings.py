@@ -5,6 +5,7 @@ import inspect
 import platform
 from collections.abc import Iterable
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -254,6 +255,16 @@ def circumstances(agent: OffPolicyAlgorithm) -> dict[str, Any]:
 def processor() -> str:
     """Return what this machine's processor can do, as far as PyTorch cares."""
     return f"{platform.machine()} {th.backends.cpu.get_cpu_capability()}"
+
+
+def processor_name() -> str:
+    """Return its name, which Python's own function knows on few systems; nothing if nobody knows it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor()
 
 
 def versions(packages: Iterable[str] = _PACKAGES) -> dict[str, str | None]:

@@ -2,10 +2,9 @@
 
 import os
 import platform
-from pathlib import Path
 from typing import Any
 
-from sb3_mcbs.checkpoints.settings import versions
+from sb3_mcbs.checkpoints.settings import processor_name, versions
 
 PACKAGES = (
     "sb3-mcbs",
@@ -29,15 +28,3 @@ def describe_machine() -> dict[str, Any]:
         "cores": os.cpu_count(),
         **versions(PACKAGES),
     }
-
-
-def processor_name() -> str:
-    """
-    :return: its name, which Python's own function knows on few systems; nothing if nobody knows it
-    """
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        lines = []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor()

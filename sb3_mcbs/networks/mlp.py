@@ -137,29 +137,30 @@ class MLP:
         """The layers' addresses and constants: MLPs of the same signature compute the same."""
         return tuple(layer if isinstance(layer, type) else layer.signature for layer in self._layers)
 
-    def rows(self) -> list[tuple[list[th.Tensor | None], int]]:
+    def rows(self) -> list[tuple[list[th.Tensor], int]]:
         """The layers as :func:`tables` lists them.
 
-        :return: for each linear layer, gain, shift, weight and bias, and the activation of its output.
+        :return: for each linear layer, its arrays (weight and bias, after gain and shift if there are any),
+            and the activation of its output.
         :raises TypeError: if they are not linear layers with at most one normalization before and one
             activation after each.
         """
-        rows: list[tuple[list[th.Tensor | None], int]] = []
-        before: list[th.Tensor | None] = [None, None]
+        rows: list[tuple[list[th.Tensor], int]] = []
+        before: list[th.Tensor] = []
         for layer in self._layers:
-            if isinstance(layer, Renormalization) and before[0] is None:
-                before = [*layer.factors()]
+            if isinstance(layer, Renormalization) and not before:
+                before = layer.factors()
             elif isinstance(layer, _Linear):
                 bias = layer.bias
                 if bias is None:
                     bias = th.zeros(len(layer.weight), device=layer.device)
                 rows.append(([*before, layer.weight, bias], 0))
-                before = [None, None]
-            elif not isinstance(layer, Renormalization) and before[0] is None and not rows[-1][1]:
+                before = []
+            elif not isinstance(layer, Renormalization) and not before and not rows[-1][1]:
                 rows[-1] = rows[-1][0], _ACTIVATIONS[layer]
             else:
                 raise TypeError("layers follow each other in an order that compiled code does not know")
-        if before[0] is not None:
+        if before:
             raise TypeError("a normalization is the last layer")
         return rows
 
@@ -253,7 +254,7 @@ def tables(mlps: Sequence[MLP]) -> tuple[list[np.ndarray], list[th.Tensor]]:
     :raises TypeError: if compiled code does not cover the order of their layers.
     """
     rows = [mlp.rows() for mlp in mlps]
-    arrays = [array for layers in rows for layer, _ in layers for array in layer if array is not None]
+    arrays = [array for layers in rows for layer, _ in layers for array in layer]
     if not _is_host(mlps[0].device):
         arrays = _copied_to_host(arrays)
     addresses = iter([array.data_ptr() for array in arrays])
@@ -261,9 +262,9 @@ def tables(mlps: Sequence[MLP]) -> tuple[list[np.ndarray], list[th.Tensor]]:
     for layers in rows:
         table = []
         for layer, activation in layers:
-            n_out, n_in = layer[2].shape  # type: ignore[union-attr]
-            entry = [0 if array is None else next(addresses) for array in layer]
-            table.append([*entry, n_in, n_out, activation])
+            n_out, n_in = layer[-2].shape
+            without = [0] * (4 - len(layer))
+            table.append([*without, *(next(addresses) for _ in layer), n_in, n_out, activation])
         found.append(np.array(table, dtype=np.int64))
     return found, arrays
 
