@@ -60,9 +60,8 @@ def test_transitions_are_those_of_a_plain_loop(make_agent, cls, normalized):
     rows, envs = (index.ravel() for index in np.meshgrid(np.arange(buffer.size()), np.arange(2)))
     branches = Branches(buffer, len(rows), STEPS, LENGTH)
     begun = buffer.expansion_held[rows, envs]
-    branches.go_on(
-        buffer, agent, KnownDraws(rows, envs, np.full(begun.sum(), LENGTH)), agent.get_vec_normalize_env()
-    )
+    draws = KnownDraws(rows, envs, np.full(begun.sum(), LENGTH))
+    branches.go_on(buffer, agent, target_actor(agent), draws, agent.get_vec_normalize_env())
     expected = [
         plain_loop(agent, env, taken[row][number], buffer.next_observations[row, number])
         for row, number in zip(rows[begun], envs[begun], strict=True)
@@ -92,11 +91,11 @@ def test_transitions_are_those_of_a_plain_loop(make_agent, cls, normalized):
 def test_branches_go_on_where_they_were(make_agent):
     agent, _ = trained(make_agent, "HalfCheetah-v5", n_envs=1, cls=MCBSCrossQ, search_share=0.0)
     buffer, rng = agent.replay_buffer, np.random.default_rng(0)
-    branches = Branches(buffer, 4, 2, 4)
-    branches.go_on(buffer, agent, KnownDraws([1, 2, 3, 4], [0] * 4, [1, 2, 3, 4]), None)
+    act, branches = target_actor(agent), Branches(buffer, 4, 2, 4)
+    branches.go_on(buffer, agent, act, KnownDraws([1, 2, 3, 4], [0] * 4, [1, 2, 3, 4]), None)
     middle, left = branches.observations.copy(), branches.left.copy()
     assert left.tolist() == [-1, 0, 1, 2]
-    branches.go_on(buffer, agent, rng, None)
+    branches.go_on(buffer, agent, act, rng, None)
     first = branches.transitions[0][12:16]  # of eight transitions the last step's come first
     goes_on = left > 0
     np.testing.assert_array_equal(first[goes_on], middle[goes_on])
@@ -111,11 +110,35 @@ def test_the_latest_transitions_are_kept(make_agent, monkeypatch):
     rng = np.random.default_rng(0)
     last = []
     for _ in range(7):
-        branches.go_on(agent.replay_buffer, agent, rng, None)
+        branches.go_on(agent.replay_buffer, agent, target_actor(agent), rng, None)
         last.append(branches.observations.copy())
     assert branches.n_added > len(branches) == 15
     held = {row.tobytes() for row in branches.transitions[2]}
     assert {row.tobytes() for row in np.concatenate(last[-3:])} <= held
+
+
+@pytest.mark.parametrize("branch_length", [0, LENGTH])
+def test_what_was_simulated_ahead_is_used_once_and_with_its_settings(make_agent, branch_length):
+    agent, _ = trained(make_agent, "HalfCheetah-v5", n_envs=1, search_share=0.0, branch_length=branch_length)
+    buffer = agent.replay_buffer
+
+    def n_simulated(call):
+        before = agent.n_simulated_steps
+        call()
+        return agent.n_simulated_steps - before
+
+    def sample():
+        return buffer.sample(16)
+
+    ahead = buffer.next_simulation(16, None)
+    assert n_simulated(ahead) > 0 == n_simulated(sample) < n_simulated(sample)
+    for name, value in dict(gamma=0.5, value_expansion=1).items():
+        buffer.next_simulation(16, None)()
+        setattr(agent, name, value)
+        assert n_simulated(sample) > 0
+    buffer.next_simulation(16, None)()
+    agent.branch_length = agent.value_expansion = 0
+    assert n_simulated(sample) == n_simulated(buffer.next_simulation(16, None)) == 0
 
 
 @pytest.mark.parametrize(("n_sampled", "n_steps", "n"), [(128, 2, 32), (128, 1, 64), (100, 3, 17), (1, 5, 1)])
@@ -195,6 +218,6 @@ def test_a_step_that_diverges_is_left_out(make_agent, cls, monkeypatch):
     monkeypatch.setattr(model, "step", diverging)
     branches = Branches(agent.replay_buffer, 4, 2, 50)
     for _ in range(3):
-        branches.go_on(agent.replay_buffer, agent, np.random.default_rng(0), None)
+        branches.go_on(agent.replay_buffer, agent, target_actor(agent), np.random.default_rng(0), None)
     assert branches.n_added == 3 * 3 * 2 and branches.left[0] == 0
     assert all(np.isfinite(column).all() for column in branches.transitions)

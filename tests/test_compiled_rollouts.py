@@ -10,8 +10,8 @@ import torch as th
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_mcbs import MCBSDDPG, MCBSSAC, MCBSTD3, MCBSCrossQ
+from sb3_mcbs.agents import expanded_buffer
 from sb3_mcbs.agents.compiled_policy import CompiledPolicy
-from sb3_mcbs.agents.expanded_buffer import ExpandedReplayBuffer
 from sb3_mcbs.agents.planner import Planner
 from sb3_mcbs.models.compiled_networks import actions_of, values_of
 from sb3_mcbs.networks import mlp
@@ -193,6 +193,10 @@ def test_the_first_line_says_which_way_rollouts_go_and_why(cls, settings, says, 
         assert "Rollouts go step by step" in caplog.text
 
 
+def not_covered(agent: object, env: object) -> None:
+    raise TypeError("by the test")
+
+
 @pytest.mark.parametrize("cls", [MCBSTD3, MCBSDDPG])
 @pytest.mark.parametrize("normalized", [False, True])
 def test_compiled_expansion_is_that_of_the_loop(cls, normalized, monkeypatch) -> None:
@@ -206,7 +210,7 @@ def test_compiled_expansion_is_that_of_the_loop(cls, normalized, monkeypatch) ->
     batches = []
     for compiled in (True, False):
         if not compiled:
-            monkeypatch.setattr(ExpandedReplayBuffer, "_roll_forward_compiled", lambda *args: False)
+            monkeypatch.setattr(expanded_buffer, "compiled_target", not_covered)
         steps = agent.n_simulated_steps
         rng = np.random.default_rng(5)
         batch = agent.replay_buffer.sample_expanded(40, rng, agent.get_vec_normalize_env())

@@ -13,7 +13,9 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_mcbs.networks import batches, graphs
+from sb3_mcbs import MCBSSAC, MCBSTD3, MCBSCrossQ
+from sb3_mcbs.agents.expanded_buffer import ExpandedReplayBuffer
+from sb3_mcbs.networks import batches, graphs, mlp
 from sb3_mcbs.networks.batches import CopiedBatches, MirroredBatches
 from tests.fake_graph import FakeBackend
 from tests.graph_helpers import GRAPHED, TANH, GraphTD3, SACSteps, agent_with_steps, assert_alike, train
@@ -313,7 +315,7 @@ def test_copies_capture_their_own(backend):
     assert_alike(ours, other)
 
 
-@pytest.mark.parametrize("settings", [{}, dict(value_expansion=2), dict(fast_update=False)])
+@pytest.mark.parametrize("settings", [{}, dict(fast_update=False)])
 def test_an_agent_that_searches_learns_the_same(settings, backend, make_agent, tmp_path):
     found = []
     for graphed in (False, True):
@@ -329,6 +331,60 @@ def test_an_agent_that_searches_learns_the_same(settings, backend, make_agent, t
     assert "train/critic_loss" in columns[0]
     assert set(columns[0].split(",")) == set(columns[1].split(","))
     assert copy(found[1])._graph_memory is not found[1]._graph_memory
+
+
+AHEAD = {
+    "stored transitions, in compiled code": (MCBSTD3, {}),
+    "stored transitions, step by step": (MCBSSAC, {}),
+    "branches": (MCBSCrossQ, dict(branch_length=4)),
+}
+
+
+@pytest.mark.parametrize("case", AHEAD)
+def test_the_next_batch_is_simulated_during_the_step(case, backend, make_agent, monkeypatch):
+    """Networks are taken for those of a GPU. The other agent has :func:`simulate_in_plain_order`."""
+    monkeypatch.setattr(mlp, "_is_host", lambda device: False)
+    cls, settings = AHEAD[case]
+    settings = dict(policy_kwargs=deepcopy(TANH), value_expansion=2) | settings
+    simulated = []
+    for name in ("draw", "simulate_ahead"):
+        method = getattr(CopiedBatches, name)
+
+        def counted(batches, *args, name=name, method=method):
+            agent = batches._buffer.expanding_agent
+            before = agent.n_simulated_steps
+            method(batches, *args)
+            simulated.append((name, agent.n_simulated_steps - before))
+
+        monkeypatch.setattr(CopiedBatches, name, counted)
+    found = []
+    for graphed in (True, False):
+        agent = make_agent("InvertedPendulum-v5", cls=cls, seed=1, cuda_graphs=graphed, **settings)
+        if not graphed:
+            monkeypatch.setattr(ExpandedReplayBuffer, "sample", ExpandedReplayBuffer.sample)
+            simulate_in_plain_order(agent)
+        agent.learn(80)
+        found.append(agent)
+    assert_alike(*found)
+    (first, n), *others = simulated
+    assert first == "draw" and n > 0 and len(others) > 100
+    assert all((n > 0) == (name == "simulate_ahead") for name, n in others)
+
+
+def simulate_in_plain_order(agent):
+    """Simulate for the next batch after every step, by the actor as it was before the step."""
+    train, sample, left = agent.train, ExpandedReplayBuffer.sample, []
+
+    def sample_first(buffer, batch_size, env=None):
+        batch = sample(buffer, batch_size, env)
+        left.append(buffer.next_simulation(batch_size, env))
+        return batch
+
+    def train_first(**kwargs):
+        train(**kwargs)
+        left.pop()()
+
+    ExpandedReplayBuffer.sample, agent.train = sample_first, train_first
 
 
 @pytest.mark.parametrize("cls", [TD3, DDPG])

@@ -14,8 +14,9 @@ from stable_baselines3.common.distributions import SquashedDiagGaussianDistribut
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_mcbs import MCBSTD3, MCBSCrossQ
+from sb3_mcbs.networks import mlp
 from sb3_mcbs.networks.batch_renorm import Renormalization
-from sb3_mcbs.networks.functions import policy_function, value_function
+from sb3_mcbs.networks.functions import policy_function, target_actor, value_function
 from sb3_mcbs.networks.mlp import MLP
 from sb3_mcbs.networks.plain_networks import actor_mlp, critic_mlps
 from sb3_mcbs.networks.torch_settings import matmul_precision, one_thread
@@ -100,6 +101,35 @@ def test_present_parameters_and_networks_are_used():
     agent.policy.actor = other.actor
     found = policy_function(agent)(observations)
     np.testing.assert_allclose(found, sb3_action(other, observations), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("cls", [TD3, DDPG, SAC, TQC, CrossQ])
+def test_networks_of_a_gpu_are_copied_as_they_are(cls, monkeypatch):
+    """Here they are on the CPU and taken for others."""
+    agent, rng = agent_of(cls), np.random.default_rng(0)
+    change_normalization(agent)
+    agent.policy.set_training_mode(False)
+    observations = rng.standard_normal((7, 17)).astype(np.float32)
+    actions = rng.uniform(-1, 1, (7, 6)).astype(np.float32)
+
+    def functions():
+        policy, value, draw = policy_function(agent), value_function(agent), target_actor(agent)
+        return lambda: [
+            policy(observations),
+            value(observations, actions),
+            *draw(observations, np.random.default_rng(0)),
+        ]
+
+    expected = functions()()
+    monkeypatch.setattr(mlp, "_is_host", lambda device: False)
+    copied = functions()
+    with th.no_grad():
+        for tensor in agent.policy.parameters():
+            tensor *= 1.1
+    for before, found in zip(expected, copied(), strict=True):
+        np.testing.assert_array_equal(found, before)
+    changed = [np.array_equal(a, b) for a, b in zip(functions()(), expected, strict=True)]
+    assert not any(changed[:3])
 
 
 def test_batch_renormalization_has_the_present_statistics():

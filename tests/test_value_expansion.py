@@ -61,6 +61,7 @@ def trained(make_agent, env_id="Hopper-v5", n_envs=2, cls=MCBSTD3, env=None, **s
 
 def entropy(agent, observations, actions):
     """What actions add to the value, ``-ent_coef * log pi(a|s)``, as SB3 computes it."""
+    agent.policy.set_training_mode(False)
     with th.no_grad():
         mean, log_std, more = agent.actor.get_action_dist_params(th.as_tensor(observations))
         distribution = agent.actor.action_dist.proba_distribution(mean, log_std, **more)

@@ -12,7 +12,7 @@ import numpy as np
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_mcbs.networks.functions import STOCHASTIC, target_actor
+from sb3_mcbs.networks.functions import STOCHASTIC, Actor
 from sb3_mcbs.networks.torch_settings import one_thread
 
 #: How often a transition is learned from, on average.
@@ -130,11 +130,14 @@ class Branches:
         """
         return self.shape == shape and self.states.shape[1] == buffer.expansion_states.shape[2]
 
-    def go_on(self, buffer: Any, agent: Any, rng: np.random.Generator, env: VecNormalize | None) -> None:
+    def go_on(
+        self, buffer: Any, agent: Any, act: Actor, rng: np.random.Generator, env: VecNormalize | None
+    ) -> None:
         """Continue the rollouts.
 
         :param buffer: the replay buffer.
-        :param agent: whose actor they follow. Simulated steps are added to its ``n_simulated_steps``.
+        :param agent: whose environments they simulate. The steps are added to its ``n_simulated_steps``.
+        :param act: the actor that they follow.
         :param rng: samples states to branch off, and the actor's actions.
         :param env: normalises observations and rewards.
         """
@@ -143,7 +146,7 @@ class Branches:
         if not len(going):
             return
         with one_thread():
-            segment = self._simulate(going, buffer, agent, rng, env)
+            segment = self._simulate(going, buffer, agent, act, rng, env)
         self._store(segment, agent.gamma)
 
     def _branch_off(self, buffer: Any, rng: np.random.Generator) -> None:
@@ -160,7 +163,13 @@ class Branches:
         self._is_new = self._is_new and not len(ended)
 
     def _simulate(
-        self, going: np.ndarray, buffer: Any, agent: Any, rng: np.random.Generator, env: VecNormalize | None
+        self,
+        going: np.ndarray,
+        buffer: Any,
+        agent: Any,
+        act: Actor,
+        rng: np.random.Generator,
+        env: VecNormalize | None,
     ) -> list[_Step]:
         """Simulate the steps of one gradient step.
 
@@ -169,7 +178,6 @@ class Branches:
         """
         planner, n_steps = agent.planner, self.shape[1]
         model, view = planner.model, planner.source.view
-        act = target_actor(agent)
         model.set_roots(list(self.states[going]), np.arange(len(going)), rng)
         before = self.observations[going]
         seen = buffer._normalize_obs(before, env)

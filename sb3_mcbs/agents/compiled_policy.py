@@ -26,7 +26,7 @@ class CompiledPolicy:
     :param agent: a supported agent.
     :param model: simulates.
     :param view: turns simulated observations and rewards into those of the networks.
-    :param target: the target actor, if there is one.
+    :param target: the target actor, if there is one, without critics.
     :raises TypeError: says what compiled code does not cover.
     """
 
@@ -36,10 +36,9 @@ class CompiledPolicy:
         if not isinstance(model, MujocoBatchModel):
             raise TypeError(f"the forward model is {model.kind!r}, not 'mujoco'")
         self._model, self._view = model, view
+        actor, critics = actor_mlp(actor_of(agent, target)), critic_mlps(agent.policy.critic)
         #: The arrays are valid as long as the weights live.
-        self._arrays, self._weights = policy_arrays(
-            agent, view, actor_mlp(actor_of(agent, target)), critic_mlps(agent.policy.critic)
-        )
+        self._arrays, self._weights = policy_arrays(agent, view, actor, [] if target else critics)
 
     def policy(self, observations: Any) -> np.ndarray:
         """The actor's actions ``[rows, act_dim]`` for observations of the environment."""
@@ -101,7 +100,7 @@ def policy_arrays(
     :param agent: a supported agent.
     :param view: turns simulated observations and rewards into those of the networks.
     :param actor: the actor.
-    :param critics: the critics.
+    :param critics: the critics; may be empty.
     :return: the arrays, and the weights behind their addresses.
     :raises TypeError: says what compiled code does not cover.
     """
@@ -115,7 +114,7 @@ def policy_arrays(
     (actor_table, *critic_tables), weights = tables([actor, *critics])
     arrays = PolicyArrays(
         actor_table,
-        np.stack(critic_tables),
+        np.stack(critic_tables) if critics else np.zeros((0, *actor_table.shape), dtype=np.int64),
         isinstance(agent, TQC),
         *_observation_scale(view),
         space.low.ravel(),

@@ -2,6 +2,7 @@
 
 import functools
 import logging
+from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -10,10 +11,10 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_mcbs.agents.branches import Branches, as_samples
+from sb3_mcbs.agents.branches import as_samples
 from sb3_mcbs.agents.compiled_policy import CompiledPolicy
 from sb3_mcbs.models import ForwardModelError
-from sb3_mcbs.networks.functions import STOCHASTIC, target_actor
+from sb3_mcbs.networks.functions import STOCHASTIC, Actor, target_actor
 from sb3_mcbs.networks.torch_settings import one_thread
 
 logger = logging.getLogger("sb3_mcbs")
@@ -37,11 +38,13 @@ class ExpandedReplayBuffer(ReplayBuffer):
 
     #: Its class without expansion.
     base_class: ClassVar[type[ReplayBuffer]]
-    not_checkpointed = ("expanding_agent", "states_after")
+    not_checkpointed = ("expanding_agent", "states_after", "_ahead")
 
     expanding_agent: Any
     #: States of the environments after the step that is added next; None for rows of others.
     states_after: np.ndarray | None = None
+    #: What was simulated for the next batch, and its settings.
+    _ahead: tuple[tuple[Any, ...], ReplayBufferSamples | None] | None = None
     expansion_states: np.ndarray
     expansion_held: np.ndarray
 
@@ -72,32 +75,89 @@ class ExpandedReplayBuffer(ReplayBuffer):
         :param env: normalises observations and rewards.
         :return: n-step transitions. Those that ended an episode are not expanded.
         """
-        agent = self.expanding_agent
-        # After a callback has switched value expansion off, no sample is expanded.
-        n_expanded = round(agent.expanded_share * batch_size) if agent.value_expansion else 0
-        branches: Branches | None = agent.go_on_with_branches(env) if n_expanded else None
-        if branches is not None and not len(branches):
-            n_expanded = 0  # no stored state to branch off
+        n_expanded = self._n_expanded(batch_size)
+        simulated = self._simulated(n_expanded, env) if n_expanded else None
+        n_own = batch_size if simulated is None else batch_size - n_expanded
         samples = []
-        if n_expanded < batch_size:
-            own: Any = super().sample(batch_size - n_expanded, env=env)
+        if n_own:
+            own: Any = super().sample(n_own, env=env)
             if own.discounts is None:
-                own = own._replace(discounts=th.full_like(own.rewards, agent.gamma))
+                own = own._replace(discounts=th.full_like(own.rewards, self.expanding_agent.gamma))
             samples.append(own)
-        if n_expanded and branches is not None:
-            samples.append(branches.sample(n_expanded, self, agent.rollout_rng, env))
-        elif n_expanded:
-            samples.append(self.sample_expanded(n_expanded, agent.rollout_rng, env))
+        if simulated is not None:
+            samples.append(simulated)
         return ReplayBufferSamples(*(th.cat(fields) for fields in zip(*samples, strict=True)))
 
+    def next_simulation(self, batch_size: int, env: VecNormalize | None) -> Callable[[], None]:
+        """What can be simulated for the next batch while a GPU learns from this one.
+
+        It follows the actor as it is now: networks on a GPU are copied before they are updated. So the
+        results do not depend on how long the GPU takes.
+
+        :param batch_size: number of transitions.
+        :param env: normalises observations and rewards.
+        :return: to be called once the update was started.
+        """
+        n_expanded = self._n_expanded(batch_size)
+        if not n_expanded:
+            return lambda: None
+        settings, simulate = self._settings(n_expanded, env), self._simulation(n_expanded, env)
+
+        def simulate_ahead() -> None:
+            self._ahead = settings, simulate()
+
+        return simulate_ahead
+
+    def _n_expanded(self, batch_size: int) -> int:
+        agent = self.expanding_agent
+        # After a callback has switched value expansion off, no sample is expanded.
+        return round(agent.expanded_share * batch_size) if agent.value_expansion else 0
+
+    def _settings(self, n: int, env: VecNormalize | None) -> tuple[Any, ...]:
+        """What transitions that were simulated ahead depend on."""
+        agent = self.expanding_agent
+        return n, env, agent, agent.planner, agent.value_expansion, agent.branch_length, agent.gamma
+
+    def _simulated(self, n: int, env: VecNormalize | None) -> ReplayBufferSamples | None:
+        """The simulated part of a batch.
+
+        :param n: number of transitions.
+        :return: ``None`` if there is no stored state to branch off.
+        """
+        (settings, samples), self._ahead = self._ahead or (None, None), None
+        if settings is not None and settings == self._settings(n, env):
+            return samples
+        return self._simulation(n, env)()
+
+    def _simulation(self, n: int, env: VecNormalize | None) -> Callable[[], ReplayBufferSamples | None]:
+        agent = self.expanding_agent
+        rng, branches = agent.rollout_rng, agent.current_branches()
+        if branches is None:
+            return functools.partial(self.sample_expanded, n, rng, env, self._forward(rng, env))
+        act = target_actor(agent)
+
+        def simulate() -> ReplayBufferSamples | None:
+            branches.go_on(self, agent, act, rng, env)
+            return branches.sample(n, self, rng, env) if len(branches) else None
+
+        return simulate
+
+    def _forward(self, rng: np.random.Generator, env: VecNormalize | None) -> "_Forward":
+        """The simulation of the target actor from stored states, in compiled code where that covers it."""
+        try:
+            return functools.partial(self._roll_forward_compiled, compiled_target(self.expanding_agent, env))
+        except TypeError:
+            return functools.partial(self._roll_forward, target_actor(self.expanding_agent), rng, env)
+
     def sample_expanded(
-        self, n: int, rng: np.random.Generator, env: VecNormalize | None
+        self, n: int, rng: np.random.Generator, env: VecNormalize | None, forward: "_Forward | None" = None
     ) -> ReplayBufferSamples:
         """Sample transitions, and roll them forward.
 
         :param n: number of transitions.
         :param rng: samples them, and is given to the forward model.
         :param env: normalises observations and rewards.
+        :param forward: rolls them forward; ``None``: with the present target actor.
         """
         at = rng.integers(0, self.size(), n), rng.integers(0, self.n_envs, n)
         path = _Path(
@@ -110,33 +170,32 @@ class ExpandedReplayBuffer(ReplayBuffer):
         if len(going):
             states = self.expansion_states[at[0][going], at[1][going]]
             with one_thread():
-                self._roll_forward(states, going, path, rng, env)
+                (forward or self._forward(rng, env))(states, going, path)
         return self._as_samples(at, path, env)
 
     def _roll_forward(
         self,
+        act: Actor,
+        rng: np.random.Generator,
+        env: VecNormalize | None,
         states: np.ndarray,
         going: np.ndarray,
         path: "_Path",
-        rng: np.random.Generator,
-        env: VecNormalize | None,
     ) -> None:
         """Simulate the target actor from stored states.
 
+        :param act: the target actor.
+        :param rng: given to the forward model and the actor.
+        :param env: normalises observations and rewards.
         :param states: ``[m, state_size]``.
         :param going: ``[m]``, the transitions' indices.
         :param path: of all transitions; changed in place.
-        :param rng: given to the forward model and the actor.
-        :param env: normalises observations and rewards.
         """
-        if self._roll_forward_compiled(states, going, path, env):
-            return
         returns, lengths, terminated, last = path
         agent, planner = self.expanding_agent, self.expanding_agent.planner
         model, view = planner.model, planner.source.view
         model.set_roots(list(states), np.arange(len(going)), rng)
         seen: Any = self._normalize_obs(last[going], env)
-        act = target_actor(agent)
         for number in range(1, agent.value_expansion + 1):
             actions, bonus = act(seen, rng)
             step = model.step(planner.unscale(actions))
@@ -158,17 +217,13 @@ class ExpandedReplayBuffer(ReplayBuffer):
                 going = going[still]
 
     def _roll_forward_compiled(
-        self, states: np.ndarray, going: np.ndarray, path: "_Path", env: VecNormalize | None
-    ) -> bool:
+        self, compiled: CompiledPolicy, states: np.ndarray, going: np.ndarray, path: "_Path"
+    ) -> None:
         """:meth:`_roll_forward` in compiled code.
 
-        :return: False, and nothing is done, if that does not cover the agent.
+        :param compiled: the target actor.
         """
         agent = self.expanding_agent
-        try:
-            compiled = compiled_target(agent, env)
-        except TypeError:
-            return False
         returns, lengths, terminated, last = path
         rolled = compiled.follow(list(states), last[going], agent.value_expansion)
         agent.n_simulated_steps += rolled.simulated_steps
@@ -177,7 +232,6 @@ class ExpandedReplayBuffer(ReplayBuffer):
         simulated = rolled.lengths[:, 0] > 0
         terminated[going[simulated]] = rolled.terminated[simulated, 0]
         last[going[simulated]] = rolled.observations[simulated, 0]
-        return True
 
     def _as_samples(
         self, at: tuple[np.ndarray, ...], path: "_Path", env: VecNormalize | None
@@ -295,6 +349,10 @@ class _Path(NamedTuple):
     lengths: np.ndarray
     terminated: np.ndarray
     observations: np.ndarray
+
+
+#: Continues n-step transitions from states ``[m, state_size]``; ``[m]``: which ones.
+_Forward = Callable[[np.ndarray, np.ndarray, _Path], None]
 
 
 def compiled_target(agent: Any, env: VecNormalize | None) -> CompiledPolicy:

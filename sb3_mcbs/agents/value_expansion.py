@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import RolloutReturn
-from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_mcbs.agents.branches import Branches, n_rollouts
 from sb3_mcbs.agents.checked_rollouts import CheckedRollouts
@@ -134,10 +133,9 @@ class Expanding(CheckedRollouts):
         if self.replay_buffer is not None:  # it may have been taken away
             ValueExpansionSettings.of(self).check_buffer(self.replay_buffer.optimize_memory_usage)
 
-    def go_on_with_branches(self, env: VecNormalize | None) -> Branches | None:
-        """Continue the simulated rollouts, which begin anew if settings or states are others.
+    def current_branches(self) -> Branches | None:
+        """The simulated rollouts, which begin anew if settings or states are others.
 
-        :param env: normalises observations and rewards.
         :return: ``None`` without a ``branch_length``.
         """
         if not self.branch_length:
@@ -146,8 +144,6 @@ class Expanding(CheckedRollouts):
         shape = n_rollouts(n_sampled, self.value_expansion), self.value_expansion, self.branch_length
         if self.branches is None or not self.branches.fits(self.replay_buffer, shape):
             self.branches = Branches(self.replay_buffer, *shape)
-        assert self.rollout_rng is not None
-        self.branches.go_on(self.replay_buffer, self, self.rollout_rng, env)
         return self.branches
 
     def _check_states(self) -> None:

@@ -1,5 +1,7 @@
 """SB3-Contrib's batch renormalization without autograd, with arrays stored ``[features, rows]``."""
 
+from collections.abc import Iterator
+from copy import copy
 from typing import Any, NamedTuple
 
 import torch as th
@@ -56,8 +58,15 @@ class Renormalization:
         self._columns: list[th.Tensor] = []
 
     @property
-    def device(self) -> th.device:
-        return self._tensors[0].device
+    def tensors(self) -> tuple[th.Tensor, ...]:
+        return self._tensors
+
+    def replaced(self, tensors: Iterator[th.Tensor]) -> "Renormalization":
+        """A copy with other :attr:`tensors`, for evaluation mode."""
+        made = copy(self)
+        made._tensors = next(tensors), next(tensors), next(tensors), next(tensors)
+        made._columns = []
+        return made
 
     @property
     def signature(self) -> tuple[Any, ...]:

@@ -4,6 +4,8 @@ Torch's graphs replay copies from the same addresses, so every batch is written 
 """
 
 import logging
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -75,6 +77,7 @@ class CopiedBatches:
         self.instead = False
         self._widths: list[int] = []
         self._parts: list[th.Tensor] = []
+        self._ahead: Callable[[], None] | None = None
 
     def fits(self, buffer: ReplayBuffer, batch_size: int, env: VecNormalize | None) -> bool:
         """Whether these are batches of this size from this replay buffer."""
@@ -86,11 +89,10 @@ class CopiedBatches:
 
         :param env: normalises observations and rewards.
         """
-        device, self._buffer.device = self._buffer.device, th.device("cpu")
-        try:
-            samples = self._buffer.sample(self._batch_size, env=env)
-        finally:
-            self._buffer.device = device
+        with self._on_host() as buffer:
+            samples = buffer.sample(self._batch_size, env=env)
+            if hasattr(buffer, "next_simulation"):
+                self._ahead = buffer.next_simulation(self._batch_size, env)
         fields = [field.numpy().reshape(self._batch_size, -1) for field in samples if field is not None]
         widths = [field.shape[1] for field in fields]
         if widths != self._widths:
@@ -101,6 +103,21 @@ class CopiedBatches:
             numbers[start : start + field.size].reshape(field.shape)[...] = field
             start += field.size
         self._staging.send(self._target)
+
+    def simulate_ahead(self) -> None:
+        """Do what the replay buffer can do for the next batch, while the device learns from this one."""
+        if self._ahead is not None:
+            with self._on_host():
+                self._ahead()
+
+    @contextmanager
+    def _on_host(self) -> Iterator[Any]:
+        """The replay buffer, which now gives tensors on the CPU."""
+        device, self._buffer.device = self._buffer.device, th.device("cpu")
+        try:
+            yield self._buffer
+        finally:
+            self._buffer.device = device
 
     def _set_up(self, widths: list[int]) -> None:
         self._widths = widths
@@ -194,6 +211,9 @@ class MirroredBatches:
         rewards[:] = buffer.rewards[rows, envs]
         dones[:] = buffer.dones[rows, envs] * (1 - buffer.timeouts[rows, envs])
         self._staging_drawn.send(self._drawn)
+
+    def simulate_ahead(self) -> None:
+        """Nothing: a plain replay buffer does not simulate."""
 
     def read(self) -> ReplayBufferSamples:
         """The batch, float32 on the device."""

@@ -1,7 +1,8 @@
 """The networks of a trained SB3 off-policy agent as functions of arrays.
 
 A function uses the networks that the agent has when the function is made: make it anew for every search or
-batch.
+batch. Plain MLPs on a GPU are copied to the CPU then: for the few rows of a step, asking the GPU takes longer
+than computing.
 """
 
 import functools
@@ -18,10 +19,13 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import obs_as_tensor
 
-from sb3_mcbs.networks.mlp import MLP
+from sb3_mcbs.networks.mlp import MLP, on_host
 from sb3_mcbs.networks.plain_networks import actor_mlp, critic_mlps
+from sb3_mcbs.networks.squashed_gaussian import SquashedGaussian
 from sb3_mcbs.types import Observations
 
+#: A function that draws actions ``[rows, act_dim]`` for observations, and computes their entropy bonus.
+Actor = Callable[[Observations, np.random.Generator], tuple[np.ndarray, np.ndarray]]
 #: Agents whose actor is a squashed Gaussian, and whose targets have an entropy term.
 STOCHASTIC = (SAC, TQC, CrossQ)
 SUPPORTED = (TD3, DDPG, *STOCHASTIC)
@@ -43,7 +47,7 @@ def check_agent(agent: OffPolicyAlgorithm) -> None:
         raise ValueError(f"A search needs a continuous (Box) action space, got {agent.action_space}.")
 
 
-def _columns(first: np.ndarray, second: np.ndarray | None, device: th.device) -> th.Tensor:
+def _columns(first: np.ndarray, second: np.ndarray | None = None) -> th.Tensor:
     """``[rows, ...]`` arrays side by side as float32 ``[features, rows]``."""
     first = first.reshape(len(first), -1).T
     if second is None:
@@ -52,13 +56,7 @@ def _columns(first: np.ndarray, second: np.ndarray | None, device: th.device) ->
         columns = np.empty((len(first) + second.shape[1], len(second)), dtype=np.float32)
         columns[: len(first)] = first
         columns[len(first) :] = second.T
-    tensor = th.from_numpy(columns)
-    # ``to`` and ``cpu`` cost as much as a layer even where they have nothing to do.
-    return tensor if device.type == "cpu" else tensor.to(device)
-
-
-def _to_numpy(tensor: th.Tensor, device: th.device) -> np.ndarray:
-    return (tensor if device.type == "cpu" else tensor.cpu()).numpy()
+    return th.from_numpy(columns)
 
 
 def actor_of(agent: Any, target: bool = False) -> Any:
@@ -96,11 +94,11 @@ def policy_function(agent: OffPolicyAlgorithm, target: bool = False) -> Callable
 
 
 def _plain_policy(mlp: MLP) -> Callable[[Any], np.ndarray]:
-    device = mlp.device
+    [mlp] = on_host([mlp])
 
     def policy(observations: np.ndarray) -> np.ndarray:
         with th.no_grad():
-            return _to_numpy(mlp(_columns(observations, None, device)), device).T
+            return mlp(_columns(observations)).numpy().T
 
     return policy
 
@@ -131,22 +129,20 @@ def value_function(agent: OffPolicyAlgorithm) -> Callable[[Observations, np.ndar
 
 
 def _plain_value(mlps: list[MLP], quantiles: bool) -> Callable[[Any, np.ndarray], np.ndarray]:
-    device = mlps[0].device
+    mlps = on_host(mlps)
 
     def value(observations: np.ndarray, actions: np.ndarray) -> np.ndarray:
         with th.no_grad():
-            inputs = _columns(observations, actions, device)
+            inputs = _columns(observations, actions)
             outputs = [mlp(inputs) for mlp in mlps]
             if quantiles:
-                return _to_numpy(th.cat(outputs).mean(dim=0), device)
-            return _to_numpy(functools.reduce(th.minimum, outputs)[0], device)
+                return th.cat(outputs).mean(dim=0).numpy()
+            return functools.reduce(th.minimum, outputs)[0].numpy()
 
     return value
 
 
-def soft_policy_function(
-    agent: OffPolicyAlgorithm,
-) -> Callable[[Observations, np.random.Generator], tuple[np.ndarray, np.ndarray]]:
+def soft_policy_function(agent: OffPolicyAlgorithm) -> Actor:
     """Sample the stochastic actor that is trained, and compute its entropy bonus.
 
     :param agent: one of :data:`STOCHASTIC`.
@@ -155,6 +151,11 @@ def soft_policy_function(
     """
     own: Any = agent
     actor, device = own.actor, agent.device
+    # SB3 has one of the two: the first where the coefficient is learned.
+    coefficient = (own.ent_coef_tensor if own.log_ent_coef is None else own.log_ent_coef.exp()).item()
+    with suppress(TypeError):
+        actor_mlp(actor)
+        return _plain_draw(SquashedGaussian(actor).on_host(), coefficient)
     if isinstance(agent, CrossQ):
         # Its ``train`` samples in training mode, in which every call changes the actor's running statistics.
         actor.set_bn_training_mode(False)
@@ -170,17 +171,22 @@ def soft_policy_function(
             # SB3's gSDE takes no latent action and inverts the squashing itself.
             arguments = (actions,) if actor.use_sde else (actions, latent)
             log_prob = distribution.log_prob(*arguments)
-            # SB3 has one of the two: the first where the coefficient is learned.
-            learned = own.log_ent_coef
-            coefficient = own.ent_coef_tensor if learned is None else learned.detach().exp()
-            return actions.cpu().numpy(), (-coefficient.item() * log_prob).cpu().numpy()
+            return actions.cpu().numpy(), (-coefficient * log_prob).cpu().numpy()
 
     return draw
 
 
-def target_actor(
-    agent: Any,
-) -> Callable[[Observations, np.random.Generator], tuple[np.ndarray, np.ndarray]]:
+def _plain_draw(actor: SquashedGaussian, coefficient: float) -> Actor:
+    def draw(observations: Any, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        noise = rng.standard_normal((len(observations), actor.act_dim), dtype=np.float32)
+        with th.no_grad():
+            drawn = actor.sample(_columns(observations), th.from_numpy(noise).t())
+            return drawn.actions.numpy().T, (-coefficient * drawn.log_prob[0]).numpy()
+
+    return draw
+
+
+def target_actor(agent: Any) -> Actor:
     """The current actor of the targets.
 
     :param agent: a supported agent.

@@ -4,7 +4,8 @@ For the small networks of continuous control these cost as much as the matrix pr
 ``[features, rows]``: products in this order are faster for few rows.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from copy import copy
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -41,8 +42,15 @@ class _Linear:
             check_parameter(self.bias)
 
     @property
-    def device(self) -> th.device:
-        return self.weight.device
+    def tensors(self) -> list[th.Tensor]:
+        return [self.weight] if self.bias is None else [self.weight, self.bias]
+
+    def replaced(self, tensors: Iterator[th.Tensor]) -> "_Linear":
+        """A copy with other :attr:`tensors`."""
+        made = copy(self)
+        made.weight, made.bias = next(tensors), None if self.bias is None else next(tensors)
+        made._column = None
+        return made
 
     @property
     def signature(self) -> tuple[Any, ...]:
@@ -128,9 +136,22 @@ class MLP:
     @property
     def device(self) -> th.device:
         """The device of the first layer."""
-        first = self._layers[0]
-        assert isinstance(first, _Linear | Renormalization)
-        return first.device
+        return self._tensors[0].device
+
+    @property
+    def _tensors(self) -> list[th.Tensor]:
+        return [tensor for layer in self._layers if not isinstance(layer, type) for tensor in layer.tensors]
+
+    def replaced(self, tensors: Iterator[th.Tensor]) -> "MLP":
+        """A copy with other parameters and statistics.
+
+        :param tensors: in the order of the layers.
+        """
+        made = copy(self)
+        made._layers = [
+            layer if isinstance(layer, type) else layer.replaced(tensors) for layer in self._layers
+        ]
+        return made
 
     @property
     def signature(self) -> tuple[Any, ...]:
@@ -153,7 +174,7 @@ class MLP:
             elif isinstance(layer, _Linear):
                 bias = layer.bias
                 if bias is None:
-                    bias = th.zeros(len(layer.weight), device=layer.device)
+                    bias = th.zeros(len(layer.weight), device=self.device)
                 rows.append(([*before, layer.weight, bias], 0))
                 before = []
             elif not isinstance(layer, Renormalization) and not before and not rows[-1][1]:
@@ -245,6 +266,25 @@ def _activate(activation: type[nn.Module], x: th.Tensor) -> th.Tensor:
     return x.relu_() if activation is nn.ReLU else x.tanh_()
 
 
+def on_host(mlps: Sequence[MLP]) -> list[MLP]:
+    """Networks on the CPU: these, or copies from a GPU, in one piece, since each copy waits for it.
+
+    :param mlps: networks on the same device.
+    """
+    if _is_host(mlps[0].device):
+        return [*mlps]
+    tensors = [tensor for mlp in mlps for tensor in mlp._tensors]
+    with th.no_grad():
+        flat = th.cat([tensor.reshape(-1) for tensor in tensors]).cpu()
+    parts = flat.split([tensor.numel() for tensor in tensors])
+    copies = iter([part.view(tensor.shape) for part, tensor in zip(parts, tensors, strict=True)])
+    return [mlp.replaced(copies) for mlp in mlps]
+
+
+def _is_host(device: th.device) -> bool:
+    return device.type == "cpu"
+
+
 def tables(mlps: Sequence[MLP]) -> tuple[list[np.ndarray], list[th.Tensor]]:
     """Networks for compiled code, which reads their present weights, or copies of these from a GPU.
 
@@ -253,28 +293,13 @@ def tables(mlps: Sequence[MLP]) -> tuple[list[np.ndarray], list[th.Tensor]]:
         addresses: the tables are valid as long as it lives.
     :raises TypeError: if compiled code does not cover the order of their layers.
     """
-    rows = [mlp.rows() for mlp in mlps]
-    arrays = [array for layers in rows for layer, _ in layers for array in layer]
-    if not _is_host(mlps[0].device):
-        arrays = _copied_to_host(arrays)
-    addresses = iter([array.data_ptr() for array in arrays])
-    found = []
-    for layers in rows:
+    found, kept = [], []
+    for mlp in on_host(mlps):
         table = []
-        for layer, activation in layers:
+        for layer, activation in mlp.rows():
             n_out, n_in = layer[-2].shape
             without = [0] * (4 - len(layer))
-            table.append([*without, *(next(addresses) for _ in layer), n_in, n_out, activation])
+            table.append([*without, *(array.data_ptr() for array in layer), n_in, n_out, activation])
+            kept += layer
         found.append(np.array(table, dtype=np.int64))
-    return found, arrays
-
-
-def _is_host(device: th.device) -> bool:
-    return device.type == "cpu"
-
-
-def _copied_to_host(arrays: list[th.Tensor]) -> list[th.Tensor]:
-    """Copy arrays from a GPU in one piece, since each copy waits for it."""
-    with th.no_grad():
-        flat = th.cat([array.reshape(-1) for array in arrays]).cpu()
-    return list(flat.split([array.numel() for array in arrays]))
+    return found, kept

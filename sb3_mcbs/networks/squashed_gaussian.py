@@ -1,12 +1,13 @@
 """The stochastic actor of SAC, TQC and CrossQ without torch's distributions and autograd."""
 
 import math
+from copy import copy
 from typing import Any, NamedTuple
 
 import torch as th
 from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN
 
-from sb3_mcbs.networks.mlp import MLP, Pass
+from sb3_mcbs.networks.mlp import MLP, Pass, on_host
 
 LOG_SQRT_TWO_PI = math.log(math.sqrt(2 * math.pi))
 
@@ -53,6 +54,12 @@ class SquashedGaussian:
     def mlps(self) -> list[MLP]:
         """All that is trained."""
         return [self.latent, self._mean, self._log_std]
+
+    def on_host(self) -> "SquashedGaussian":
+        """This actor on the CPU, see :func:`~.mlp.on_host`."""
+        made = copy(self)
+        made.latent, made._mean, made._log_std = on_host(self.mlps)
+        return made
 
     def sample(
         self, observations: th.Tensor, noise: th.Tensor, past_warmup: tuple[bool, ...] | None = None

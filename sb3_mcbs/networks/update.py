@@ -132,6 +132,7 @@ class Update:
 
                 memory.graphs.follow(self._signature(batches), self)
                 memory.graphs.run(kind, step, device)
+                batches.simulate_ahead()  # does not wait for the step
         agent.logger.record("train/n_updates", agent._n_updates, exclude="tensorboard")
 
     def _signature(self, batches: Batches) -> tuple[Any, ...]:
