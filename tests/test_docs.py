@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import huggingface_hub
+import pandas as pd
 import pytest
 import yaml
 from markdown_it import MarkdownIt
@@ -278,6 +279,12 @@ def field_defaults(*classes: type) -> dict[str, object]:
     return {
         field.name: field.default for cls in classes for field in fields(cls) if field.name in cls.in_group()
     }
+
+
+def test_the_results_are_those_of_their_csv_file() -> None:
+    tables = runpy.run_path(str(DOCS / "results" / "tables.py"))
+    page = tables["PAGE"].read_text()
+    assert tables["with_tables"](page, pd.read_csv(tables["CSV"])) == page
 
 
 def test_the_page_of_settings_has_all_with_their_defaults() -> None:
