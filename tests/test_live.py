@@ -1,10 +1,19 @@
-"""The live view: what the Studio gets, and that only this machine can reach it."""
+"""The live view: what the Studio gets, that only this machine can reach it, and that its process always ends."""
 
 import importlib.util
+import os
+import signal
+import socket
+import subprocess
 import sys
+import time
 import urllib.request
+from collections.abc import Iterator
+from multiprocessing import Pipe
+from types import SimpleNamespace
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 import pytest
 from stable_baselines3 import TD3
@@ -13,40 +22,68 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_mcbs import SearchPolicy, SnapshotEnvWrapper
 from sb3_mcbs.video import Performer, RenderingError, show_live
 from sb3_mcbs.video.bodies import mujoco_data
-from sb3_mcbs.video.live import MOST_GEOMS, LiveScene
+from sb3_mcbs.video.live import MOST_LINES, LiveScene
 from sb3_mcbs.zoo.watch import parser, watch
 from tests.conftest import SMALL
 
-HAS_STUDIO = importlib.util.find_spec("mujoco") and importlib.util.find_spec("mujoco.studio")
+ENV_ID = "InvertedDoublePendulum-v5"
+HAS_STUDIO = importlib.util.find_spec("mujoco.studio") is not None
 needs_studio = pytest.mark.skipif(not HAS_STUDIO, reason="needs the Studio of MuJoCo 4")
 
 
-def make_performer(env_id: str = "InvertedDoublePendulum-v5") -> Performer:
+def make_performer(env_id: str = ENV_ID) -> Performer:
     vec_env = DummyVecEnv([lambda: SnapshotEnvWrapper(gym.make(env_id))])
     agent = TD3("MlpPolicy", vec_env, seed=0, **SMALL)
     return Performer("TD3", SearchPolicy(agent, vec_env, seed=0, preset="efficient"), vec_env)
 
 
+def make_env() -> SnapshotEnvWrapper:
+    env = SnapshotEnvWrapper(gym.make(ENV_ID))
+    env.reset(seed=0)
+    return env
+
+
+@pytest.fixture(autouse=True)
+def studios(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[subprocess.Popen]]:
+    """The Studios' processes that a test began. None may be left when it ends."""
+    begun = []
+    close = LiveScene.close
+    monkeypatch.setattr(LiveScene, "close", lambda self: (begun.append(self.process), close(self))[1])
+    yield begun
+    assert all(process.returncode is not None for process in begun)
+
+
 @needs_studio
-def test_the_studio_shows_what_happens_on_this_machine_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    shown, pages = [], []
-    draw = LiveScene.draw
+def test_the_studio_shows_what_happens_on_this_machine_only(
+    monkeypatch: pytest.MonkeyPatch, studios: list[subprocess.Popen]
+) -> None:
+    sent, pages = [], []
+    send = LiveScene._send
 
-    def watched(self: LiveScene, look) -> None:
-        draw(self, look)
-        assert self._viewer._http_sock.getsockname()[0] == "127.0.0.1"
-        shown.append((len(self._viewer.extra_geoms), self._data.qpos.copy()))
-        assert self._data is not mujoco_data(self._env)
-        np.testing.assert_array_equal(self._data.qpos, mujoco_data(self._env).qpos)
-        self._data.qpos[:] = 0  # as a click on "reset" does
+    def watched(self: LiveScene, message) -> None:
+        if isinstance(message, tuple):
+            position = mujoco_data(self._env).qpos
+            np.testing.assert_array_equal(
+                message[1][1 : 1 + len(position)], position
+            )  # the time is before it
+        sent.append(message)
+        send(self, message)
 
-    monkeypatch.setattr(LiveScene, "draw", watched)
-    outcomes = show_live(
-        make_performer(), [3], steps=5, begun=lambda url: pages.append(urllib.request.urlopen(url).status)
-    )
-    assert pages == [200]
-    assert len(shown) == 5 and all(0 < geoms <= MOST_GEOMS for geoms, _ in shown)
-    assert not np.array_equal(shown[0][1], shown[-1][1])
+    def visit(url: str) -> None:
+        pages.extend(urllib.request.urlopen(url + page).status for page in ("", "model"))
+        port = int(url.strip("/").rpartition(":")[2])
+        for other in ("127.0.0.2", "::1"):  # reached only by what listens on all interfaces
+            with pytest.raises(OSError):
+                socket.create_connection((other, port), timeout=2)
+
+    monkeypatch.setattr(LiveScene, "_send", watched)
+    outcomes = show_live(make_performer(), [3], steps=5, begun=visit)
+    assert pages == [200, 200]
+    _, *drawn = sent
+    assert len(drawn) == 5 and all(model is None for model, _, _ in drawn)
+    assert all(0 < len(lines) <= MOST_LINES and lines.shape[1] == 10 for _, _, lines in drawn)
+    assert not np.array_equal(drawn[0][1], drawn[-1][1])
+    assert [studio.returncode for studio in studios] == [0]
 
     alone = make_performer()
     alone.vec_env.seed(0)
@@ -60,20 +97,133 @@ def test_the_studio_shows_what_happens_on_this_machine_only(monkeypatch: pytest.
 
 
 @needs_studio
-def test_a_view_that_is_closed_ends_the_episode(monkeypatch: pytest.MonkeyPatch) -> None:
-    draws = []
-    monkeypatch.setattr(LiveScene, "draw", lambda self, look: draws.append(look))
-    monkeypatch.setattr(LiveScene, "is_open", property(lambda self: len(draws) < 3))
-    outcomes = show_live(make_performer(), range(9), begun=lambda url: None)
-    assert len(draws) == 3 and [outcome.steps for outcome in outcomes] == [2]
+def test_views_one_after_another_and_at_once() -> None:
+    env = make_env()
+    for _ in range(2):
+        scenes = [LiveScene(env), LiveScene(env)]
+        assert len({scene.url for scene in scenes}) == 2
+        for scene in scenes:
+            scene.draw(None)
+            assert urllib.request.urlopen(scene.url).status == 200
+            scene.close()
+
+
+@needs_studio
+def test_the_studio_takes_over_models_states_and_lines(monkeypatch: pytest.MonkeyPatch) -> None:
+    from mujoco.studio import launch_thread
+
+    from sb3_mcbs.video import studio
+
+    ended = []
+    monkeypatch.setattr(studio.os, "_exit", ended.append)
+    model, rows = mujoco_data(make_env()).model, np.arange(10.0)[None]
+    here, there = Pipe()
+    here.send((model, np.arange(3.0), rows))
+    here.close()
+    viewer, pipe_end = launch_thread.make_thread_endpoints()
+    with pytest.raises(EOFError):
+        studio._forward(there, pipe_end)
+    assert ended == [0]
+    (event,) = viewer.get_sim_events()
+    np.testing.assert_array_equal(event.model.geom_size, model.geom_size)
+    state, lines = viewer.get_sim_snapshots()
+    np.testing.assert_array_equal(state.state, np.arange(3.0))
+
+    shown = SimpleNamespace(extra_geoms=["old"])
+    studio.OnThisMachine.on_lines(shown, lines)
+    (geom,) = shown.extra_geoms
+    np.testing.assert_allclose(geom.pos, (rows[0, :3] + rows[0, 3:6]) / 2)
+    np.testing.assert_allclose(geom.rgba, [7, 8, 9, 1])
+    assert geom.size[0] == 6
+
+
+@needs_studio
+def test_a_new_simulator_is_followed(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, sent = LiveScene(make_env()), []
+    monkeypatch.setattr(scene, "_send", sent.append)
+    scene._env = make_env()
+    scene.draw(None)
+    scene.draw(None)
+    scene.close()
+    assert [model is not None for model, _, _ in sent] == [True, False]
+
+
+@needs_studio
+def test_a_studio_that_ends_is_one_error() -> None:
+    env = make_env()
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(
+            RenderingError, match=f"Port {port} is already in use: choose another one with --live"
+        ):
+            LiveScene(env, port=port)
+    scene = LiveScene(env)
+    scene.process.send_signal(signal.SIGSEGV)
+    scene.process.wait(10)
+    with pytest.raises(RenderingError, match="was ended by SIGSEGV"):
+        scene.draw(None)
+    scene.close()
+
+
+@needs_studio
+def test_a_studio_that_hangs_is_ended(monkeypatch: pytest.MonkeyPatch, studios: list) -> None:
+    monkeypatch.setattr("sb3_mcbs.video.live._END", 0.1)
+    scene = LiveScene(make_env())
+    scene.process.send_signal(signal.SIGSTOP)
+    scene.close()
+    assert [studio.returncode for studio in studios] == [-signal.SIGKILL]
+
+
+SHOW = """
+from tests.test_live import *
+import sb3_mcbs.video.recording as recording
+
+class Told(recording.LiveScene):
+    def draw(self, look):
+        super().draw(look)
+        print(self.process.pid, flush=True)
+
+recording.LiveScene = Told
+print(show_live(make_performer(), range(10**6), begun=lambda url: None)[-1].label)
+"""
+
+
+@needs_studio
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+def test_the_studio_ends_with_who_began_it(how: signal.Signals) -> None:
+    main = subprocess.Popen(
+        [sys.executable, "-c", SHOW],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    studio = int(main.stdout.readline())
+    assert alive(studio)
+    os.killpg(main.pid, how)  # as Ctrl-C does
+    output, errors = main.communicate(timeout=20)
+    deadline = time.monotonic() + 10
+    while alive(studio) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not alive(studio)
+    if how is signal.SIGINT:
+        assert main.returncode == 0 and output.endswith("TD3\n") and not errors
+
+
+def alive(pid: int) -> bool:
+    """Whether a process runs, and is not only waited for."""
+    try:
+        with open(f"/proc/{pid}/stat") as status:
+            return status.read().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
 
 
 def test_what_cannot_be_shown_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(RenderingError, match="an environment that MuJoCo simulates"):
         show_live(make_performer("Pendulum-v1"), [0])
-    monkeypatch.setitem(sys.modules, "mujoco.studio", None)
-    monkeypatch.setitem(sys.modules, "mujoco.studio.launch_thread", None)
-    with pytest.raises(RenderingError, match="needs the Studio of MuJoCo 4"):
+    monkeypatch.setattr(mujoco, "__version__", "3.17.0")
+    with pytest.raises(RenderingError, match="needs MuJoCo 4; this is 3.17.0"):
         show_live(make_performer(), [0])
 
 

@@ -136,9 +136,9 @@ def show_live(
     :param magnify: see :func:`record_episodes`
     :param port: of this machine; 0: the first free one from 8080 on
     :param begun: is told the address
-    :return: the episodes, until the view was closed or interrupted
+    :return: the episodes, until Ctrl-C
     :raises ValueError: if a body does not exist, or an environment is not alone or in another process
-    :raises RenderingError: if there is no live view of this environment, or in this version of MuJoCo
+    :raises RenderingError: if there is no live view of this environment, or the Studio ends
     """
     stage = _Stage(performer, partial(LiveScene, title=performer.label, port=port, magnify=magnify), bodies)
     outcomes: list[Outcome] = []
@@ -148,13 +148,9 @@ def show_live(
             next_frame = time.perf_counter()
             for _ in _act([stage], seed, 0, steps):
                 stage.draw()
-                if not stage.scene.is_open:
-                    break
                 next_frame = max(next_frame + 1 / stage.real_fps, time.perf_counter())
                 time.sleep(max(0.0, next_frame - time.perf_counter()))
             outcomes.append(stage.outcome(seed))
-            if not stage.scene.is_open:
-                break
     except KeyboardInterrupt:
         outcomes.append(stage.outcome(seed))
     finally:

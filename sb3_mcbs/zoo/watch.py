@@ -59,7 +59,7 @@ def show(subject: Subject, seed: int, preset: Preset | None, **how: Any) -> list
     :param seed: of the first reset and of the search; later resets have the next ones
     :param preset: see :func:`record`
     :param how: further arguments of :func:`sb3_mcbs.video.show_live`
-    :return: the episodes, until the view was closed or interrupted
+    :return: the episodes, until Ctrl-C
     """
     env = subject.make_env()
     agent = subject.load(env)
