@@ -1,10 +1,10 @@
 """
 MuJoCo's Studio in a process of its own: ``python studio.py FD``, where ``FD`` is one end of a pipe.
 
-There can be one Studio per process, and here a crash ends nothing else. Through the pipe come the arguments of
-``_open``, answered with the address or with what is wrong, and then models, states and lines. The process ends
-when the other end of the pipe is closed, also if who held it was killed. It imports nothing of this package, so
-that it begins at once.
+There can be one Studio per process, and here a crash ends nothing else. Through the pipe come the arguments
+of ``_open``, answered with the address or with what is wrong, and then models, states and lines. The process
+ends when the other end of the pipe is closed, also if who held it was killed. It imports nothing of this
+package, so that it begins at once.
 """
 
 import os
