@@ -21,7 +21,7 @@ from sb3_mcbs.video.scene import Magnifier, RenderingError, extend_floors, ways_
 MOST_LINES = 1024
 #: A decision's lines have this radius per pixel of width in a video, the camera this distance, and at first
 #: this height is seen: as multiples of the robot's size.
-_RADIUS, _DISTANCE, _VISIBLE = 4e-3, 6.0, 4.0
+_RADIUS, _DISTANCE, _VISIBLE = 6e-3, 6.0, 4.0
 #: Seconds in which the Studio must have begun, and in which it must have ended.
 _BEGIN, _END = 60.0, 3.0
 

@@ -42,6 +42,10 @@ class OnThisMachine(web_viewer.WebViewer):
         host, port = self._http_sock.getsockname()[:2]
         return host, port
 
+    def listen(self) -> None:
+        """Let browsers wait for the server, whose thread has only begun."""
+        self._http_sock.listen()
+
     @messages.handler
     def on_lines(self, lines: Lines) -> None:
         """Draw other lines than before."""
@@ -73,6 +77,7 @@ def _open(
     viewer = OnThisMachine(config, endpoint, model=model, camera=view)
     if viewer.address[0] != HOST:
         raise RuntimeError(f"in MuJoCo {mujoco.__version__} it would be reachable from other machines")
+    viewer.listen()
     return viewer
 
 
