@@ -191,14 +191,15 @@ def test_ctrl_c_ends_both(monkeypatch: pytest.MonkeyPatch, studios: list[subproc
 
 
 def _hold_a_view(told) -> None:
-    told.send(LiveScene(make_env()).process.pid)
+    scene = LiveScene(make_env())
+    told.send(scene.process.pid)
     signal.pause()
 
 
 @needs_studio
 def test_the_studio_ends_when_who_began_it_is_killed() -> None:
     here, there = Pipe()
-    main = multiprocessing.get_context("fork").Process(target=_hold_a_view, args=(there,))
+    main = multiprocessing.get_context("fork").Process(target=_hold_a_view, args=(there,), daemon=True)
     main.start()
     assert here.poll(30)
     studio = here.recv()
