@@ -170,6 +170,7 @@ def test_a_studio_that_hangs_is_ended(monkeypatch: pytest.MonkeyPatch, studios: 
     monkeypatch.setattr("sb3_mcbs.video.live._END", 0.1)
     scene = LiveScene(make_env())
     scene.process.send_signal(signal.SIGSTOP)
+    assert becomes(scene.process.pid, "T")
     scene.close()
     assert [studio.returncode for studio in studios] == [-signal.SIGKILL]
 
@@ -203,22 +204,26 @@ def test_the_studio_ends_when_who_began_it_is_killed() -> None:
     main.start()
     assert here.poll(30)
     studio = here.recv()
-    assert alive(studio)
+    assert state(studio) != "Z"
     main.kill()
     main.join()
+    assert becomes(studio, "Z")
+
+
+def becomes(pid: int, letter: str) -> bool:
+    """Whether a process soon is in a state: ``T``, stopped, or ``Z``, ended (waited for, or not any more)."""
     deadline = time.monotonic() + 10
-    while alive(studio) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert not alive(studio)
+    while (now := state(pid)) != letter and time.monotonic() < deadline:
+        time.sleep(0.02)
+    return now == letter
 
 
-def alive(pid: int) -> bool:
-    """Whether a process runs, and is not only waited for."""
+def state(pid: int) -> str:
     try:
         with open(f"/proc/{pid}/stat") as status:
-            return status.read().rpartition(")")[2].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
+            return status.read().rpartition(")")[2].split()[0]
+    except (FileNotFoundError, ProcessLookupError):
+        return "Z"
 
 
 def test_what_cannot_be_shown_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
