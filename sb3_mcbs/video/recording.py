@@ -2,7 +2,8 @@
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,6 +18,7 @@ from sb3_mcbs.agents import SearchPolicy
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 from sb3_mcbs.video.bodies import mujoco_data
 from sb3_mcbs.video.files import check_path, open_video
+from sb3_mcbs.video.live import LiveScene
 from sb3_mcbs.video.looks import Onlooker
 from sb3_mcbs.video.panel import ALONE, COMPARED, Panel, Shown
 from sb3_mcbs.video.scene import EnvironmentPicture, MujocoScene
@@ -96,7 +98,7 @@ def record_episodes(
     outcomes: list[Outcome] = []
     try:
         for performer in performers:
-            stages.append(_Stage(performer, size, bodies, magnify))
+            stages.append(_Stage(performer, partial(_picture, size=size, magnify=magnify), bodies))
         panel = Panel(title or performers[0].label, subtitle)
         frame = partial(_frame, panel, stages)
         with open_video(path, stages[0].fps) as video, _progress_bar(steps, seeds, progress) as bar:
@@ -114,11 +116,60 @@ def record_episodes(
     return outcomes
 
 
+def show_live(
+    performer: Performer,
+    seeds: Iterable[int],
+    *,
+    steps: int | None = None,
+    bodies: Sequence[str] = (),
+    magnify: float | None = None,
+    port: int = 0,
+    begun: Callable[[str], None] = print,
+) -> list[Outcome]:
+    """
+    Show episodes in the browser as they happen, not faster than in reality.
+
+    :param performer: who acts in an environment that MuJoCo simulates
+    :param seeds: of the environment, one per episode
+    :param steps: of each episode, at most; None: until it ends
+    :param bodies: see :func:`record_episodes`
+    :param magnify: see :func:`record_episodes`
+    :param port: of this machine; 0: the first free one from 8080 on
+    :param begun: is told the address
+    :return: the episodes, until Ctrl-C
+    :raises ValueError: if a body does not exist, or an environment is not alone or in another process
+    :raises RenderingError: if there is no live view of this environment, or the Studio ends
+    """
+    stage = _Stage(performer, partial(LiveScene, title=performer.label, port=port, magnify=magnify), bodies)
+    outcomes: list[Outcome] = []
+    try:
+        begun(stage.scene.url)
+        for seed in seeds:
+            next_frame = time.perf_counter()
+            for _ in _act([stage], seed, 0, steps):
+                stage.draw()
+                next_frame = max(next_frame + 1 / stage.real_fps, time.perf_counter())
+                time.sleep(max(0.0, next_frame - time.perf_counter()))
+            outcomes.append(stage.outcome(seed))
+    except KeyboardInterrupt:
+        outcomes.append(stage.outcome(seed))
+    finally:
+        stage.close()
+    return outcomes
+
+
+def _picture(
+    env: SnapshotEnvWrapper, size: tuple[int, int], magnify: float | None
+) -> MujocoScene | EnvironmentPicture:
+    in_mujoco = mujoco_data(env) is not None
+    return MujocoScene(env, size, magnify) if in_mujoco else EnvironmentPicture(env, size)
+
+
 class _Stage:
     """One environment, who acts in it, and its picture."""
 
     def __init__(
-        self, performer: Performer, size: tuple[int, int], bodies: Sequence[str], magnify: float | None
+        self, performer: Performer, make_scene: Callable[[SnapshotEnvWrapper], Any], bodies: Sequence[str]
     ) -> None:
         self.label, self.policy, self.vec_env = performer
         self._env = _single_environment(self.vec_env)
@@ -128,15 +179,17 @@ class _Stage:
         self.reset(0)  # some environments have a simulator only then
         policy = self.policy
         self._onlooker = Onlooker(policy, self._env, bodies) if isinstance(policy, SearchPolicy) else None
-        in_mujoco = mujoco_data(self._env) is not None
-        self.scene: MujocoScene | EnvironmentPicture = (
-            MujocoScene(self._env, size, magnify) if in_mujoco else EnvironmentPicture(self._env, size)
-        )
+        self.scene = make_scene(self._env)
+
+    @property
+    def real_fps(self) -> float:
+        """Steps per second as in reality."""
+        return float(self._env.metadata.get("render_fps") or _MOST_FPS)
 
     @property
     def fps(self) -> float:
         """Steps per second as in reality, or fewer so that each can be seen."""
-        return min(float(self._env.metadata.get("render_fps") or _MOST_FPS), _MOST_FPS)
+        return min(self.real_fps, _MOST_FPS)
 
     def reset(self, seed: int) -> None:
         """Begin an episode."""

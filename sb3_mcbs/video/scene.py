@@ -14,7 +14,7 @@ from PIL import Image, ImageOps
 
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 from sb3_mcbs.video.bodies import body_positions, find_bodies, mujoco_data
-from sb3_mcbs.video.canvas import BACKGROUND, BLACK, WHITE, Canvas, rank_color
+from sb3_mcbs.video.canvas import BACKGROUND, BLACK, WHITE, Canvas, Color, rank_color
 from sb3_mcbs.video.looks import Look
 
 #: How far most candidates are drawn from the policy's own action, as a share of the picture's height.
@@ -67,22 +67,51 @@ class EnvironmentPicture:
         """Nothing is held."""
 
 
+class Magnifier:
+    """
+    Magnifies the distances of rollouts from the policy's own action, which are often millimetres.
+
+    :param fixed: the factor; None: so that they can be seen
+    """
+
+    def __init__(self, fixed: float | None) -> None:
+        self._fixed = fixed
+        self._distances: list[float] = []
+
+    def note(self, look: Look) -> None:
+        """Remember how far candidates go from the way of the policy's own action, drawn or not.
+
+        :param look: a decision.
+        """
+        if look.own is not None and look.traces:
+            apart = [_apart(way, look.own).max() for _, way in look.traces]
+            self._distances.append(float(np.quantile(apart, 0.8)))
+
+    def factor(self, visible_height: float) -> float:
+        """The present factor.
+
+        :param visible_height: of what is seen.
+        """
+        if self._fixed is not None:
+            return self._fixed
+        distance = float(np.median(self._distances)) if self._distances else 0.0
+        wanted = _SPREAD * visible_height
+        return _round_number(wanted / distance) if 0 < distance < wanted else 1.0
+
+
 class MujocoScene:
     """
     MuJoCo's scene with the bodies' ways along the candidates' rollouts.
 
-    Candidates often differ by millimetres, so their distances from the policy's own action are magnified.
-
     :param env: the environment
     :param size: width and height in pixels
-    :param magnify: factor of those distances; None: so that they can be seen
+    :param magnify: see :class:`Magnifier`
     :raises RenderingError: if MuJoCo cannot draw here
     """
 
     def __init__(self, env: SnapshotEnvWrapper, size: tuple[int, int], magnify: float | None = None) -> None:
         self._env, self._size = env, size
-        self._fixed = magnify
-        self._distances: list[float] = []
+        self._magnifier = Magnifier(magnify)
         self._visible_height = 1.0
         self._pan = np.zeros(3)
         self._data: Any = None
@@ -93,20 +122,14 @@ class MujocoScene:
     @property
     def magnified(self) -> float:
         """The factor by which differences between rollouts are magnified."""
-        if self._fixed is not None:
-            return self._fixed
-        distance = float(np.median(self._distances)) if self._distances else 0.0
-        wanted = _SPREAD * self._visible_height
-        return _round_number(wanted / distance) if 0 < distance < wanted else 1.0
+        return self._magnifier.factor(self._visible_height)
 
     def note(self, look: Look) -> None:
         """Remember how far candidates go from the way of the policy's own action, drawn or not.
 
         :param look: a decision.
         """
-        if look.own is not None and look.traces:
-            apart = [_apart(way, look.own).max() for _, way in look.traces]
-            self._distances.append(float(np.quantile(apart, 0.8)))
+        self._magnifier.note(look)
 
     def draw(self, look: Look | None) -> Image.Image:
         """Draw the present state.
@@ -146,7 +169,7 @@ class MujocoScene:
         self._model = copy.deepcopy(self._data.model)
         width, height = self._size
         self._model.vis.global_.offwidth, self._model.vis.global_.offheight = width, height
-        _extend_floors(self._model)
+        extend_floors(self._model)
         self._gl, self._context = _open_gl(self._model, self._size)
         self._option = mujoco.MjvOption()
         self._scene = mujoco.MjvScene(self._model, maxgeom=10_000)
@@ -213,8 +236,13 @@ class View:
         return np.stack([width / 2 + across * scale, height / 2 - up * scale], axis=1)
 
 
-def _draw_traces(canvas: Canvas, look: Look, view: View, magnified: float) -> None:
-    """Draw low values first, then what was chosen, and the policy's own action on top."""
+def ways_of(look: Look, magnified: float) -> list[tuple[np.ndarray, Color, float]]:
+    """The lines of a decision: low values first, then what was chosen, and the policy's own action on top.
+
+    :param look: the decision, where bodies are known.
+    :param magnified: factor of the distances from the policy's own action.
+    :return: positions ``[steps, bodies, 3]``, colour, and width in pixels.
+    """
     assert look.own is not None
     ranks = look.ranks
     valid = [trace for trace in look.traces if np.isfinite(look.values[trace[0]])]
@@ -222,11 +250,17 @@ def _draw_traces(canvas: Canvas, look: Look, view: View, magnified: float) -> No
     ways = [(way, rank_color(ranks[index]), 2.5) for index, way in sorted(others, key=lambda t: ranks[t[0]])]
     ways += [(way, rank_color(ranks[index]), 6.0) for index, way in valid if index == look.chosen]
     ways.append((look.own, WHITE, 2.0))
+    found = []
     for way, color, width in ways:
         apart = _apart(way, look.own)
-        shown = look.own[: len(apart)] + magnified * apart
-        for body in range(shown.shape[1]):
-            points = view.project(shown[:, body])
+        found.append((look.own[: len(apart)] + magnified * apart, color, width))
+    return found
+
+
+def _draw_traces(canvas: Canvas, look: Look, view: View, magnified: float) -> None:
+    for way, color, width in ways_of(look, magnified):
+        for body in range(way.shape[1]):
+            points = view.project(way[:, body])
             canvas.line(points, BLACK, width + 2)
             canvas.line(points, color, width)
 
@@ -243,7 +277,7 @@ def _round_number(value: float) -> float:
     return power * max(digit for digit in (1, 2, 5) if digit * power <= value * (1 + 1e-9))
 
 
-def _extend_floors(model: Any) -> None:
+def extend_floors(model: Any) -> None:
     """Draw large floors without end: agents run beyond them, since they have none in the simulation."""
     floors = (model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) & (model.geom_size[:, :2].min(axis=1) >= 10)
     for floor in np.flatnonzero(floors):

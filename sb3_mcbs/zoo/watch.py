@@ -1,13 +1,14 @@
 """``sb3-mcbs watch AGENT --env ENV -o FILE``: a video of an agent and of what its search looks at."""
 
 import argparse
+import itertools
 from pathlib import Path
 from typing import Any
 
 from sb3_mcbs.agents import SearchPolicy
 from sb3_mcbs.search import PRESETS
 from sb3_mcbs.types import Preset
-from sb3_mcbs.video import Outcome, Performer, record_episodes
+from sb3_mcbs.video import Outcome, Performer, record_episodes, show_live
 from sb3_mcbs.zoo.arguments import add_agent, errors_in_words, positive, whole_number
 from sb3_mcbs.zoo.subject import DEFAULT_PRESET, Subject, default_preset, find_subject
 
@@ -50,6 +51,28 @@ def record(
             performer.vec_env.close()
 
 
+def show(subject: Subject, seed: int, preset: Preset | None, **how: Any) -> list[Outcome]:
+    """
+    Show episodes of an agent that searches in the browser, one after another.
+
+    :param subject: the agent and its environment
+    :param seed: of the first reset and of the search; later resets have the next ones
+    :param preset: see :func:`record`
+    :param how: further arguments of :func:`sb3_mcbs.video.show_live`
+    :return: the episodes, until Ctrl-C
+    """
+    env = subject.make_env()
+    agent = subject.load(env)
+    policy = SearchPolicy(agent, env, seed=seed, preset=preset or default_preset(agent))
+    performer = Performer(f"{type(agent).__name__} with search", policy, env)
+    seeds = itertools.count(seed) if how.get("steps") is None else [seed]
+    try:
+        return show_live(performer, seeds, **how)
+    finally:
+        policy.close()
+        env.close()
+
+
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     result = argparse.ArgumentParser(
@@ -60,10 +83,24 @@ def parser() -> argparse.ArgumentParser:
     )
     add_agent(result)
     add: Any = result.add_argument
-    add("-o", "--output", required=True, metavar="FILE", help="ends with .mp4, .gif, or .png (four moments)")
+    where: Any = result.add_mutually_exclusive_group(required=True)
+    where.add_argument("-o", "--output", metavar="FILE", help="ends with .mp4, .gif, or .png (four moments)")
+    where.add_argument(
+        "--live",
+        nargs="?",
+        type=whole_number(0),
+        const=0,
+        metavar="PORT",
+        help="show it in a browser of this machine instead, by default at the first free port from 8080 on",
+    )
     add("--compare", action="store_true", help="show the actor alone beside it, from the same seed")
     add("--seed", type=whole_number(0), default=0, metavar="N", help="of reset and search, by default 0")
-    add("--steps", type=whole_number(1), default=200, metavar="N", help="to record at most, by default 200")
+    add(
+        "--steps",
+        type=whole_number(1),
+        metavar="N",
+        help="at most, by default 200; live: all",
+    )
     add("--start", type=whole_number(0), default=0, metavar="N", help="steps before those, not recorded")
     add(
         "--preset",
@@ -90,25 +127,49 @@ def parser() -> argparse.ArgumentParser:
 
 def watch(args: argparse.Namespace) -> None:
     """
-    Record a video, and print what it shows.
+    Record a video or show it live, and print what it shows.
 
     :param args: see :func:`parser`
+    :raises ValueError: if an option does not go with a live view
     """
+    if args.live is not None:
+        _watch_live(args)
+        return
     outcomes = record(
         args.output,
         find_subject(args),
         args.seed,
         args.preset,
         args.compare,
-        steps=args.steps,
+        steps=args.steps or 200,
         start=args.start,
         bodies=args.body,
         magnify=args.magnify,
     )
+    _print(outcomes)
+    print(f"wrote {args.output}")
+
+
+def _watch_live(args: argparse.Namespace) -> None:
+    if args.compare or args.start:
+        raise ValueError("--live shows one agent from its first step: leave out --compare and --start.")
+    outcomes = show(
+        find_subject(args),
+        args.seed,
+        args.preset,
+        steps=args.steps,
+        bodies=args.body,
+        magnify=args.magnify,
+        port=args.live,
+        begun=lambda url: print(f"Open {url} in a browser of this machine. Ctrl-C ends it.", flush=True),
+    )
+    _print(outcomes)
+
+
+def _print(outcomes: list[Outcome]) -> None:
     for outcome in outcomes:
         ended = f", {outcome.ended}" if outcome.ended else ""
         print(f"{outcome.label}: return {outcome.total:.1f} in {outcome.steps} steps{ended}")
-    print(f"wrote {args.output}")
 
 
 def main() -> None:
