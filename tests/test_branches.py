@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch as th
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_mcbs import MCBSSAC, MCBSTD3, MCBSCrossQ
@@ -139,6 +140,16 @@ def test_what_was_simulated_ahead_is_used_once_and_with_its_settings(make_agent,
     buffer.next_simulation(16, None)()
     agent.branch_length = agent.value_expansion = 0
     assert n_simulated(sample) == n_simulated(buffer.next_simulation(16, None)) == 0
+    agent.value_expansion, agent.branch_length = 1, branch_length
+    assert n_simulated(sample) > 0  # not what an old actor did
+
+
+def test_a_batch_can_be_sampled_on_a_device_while_another_waits_on_the_cpu(make_agent):
+    agent, _ = trained(make_agent, "HalfCheetah-v5", n_envs=1, search_share=0.0)
+    buffer = agent.replay_buffer
+    buffer.next_simulation(16, None)()
+    buffer.device = th.device("meta")  # as a GPU's, without numbers
+    assert {field.device.type for field in buffer.sample(16)} == {"meta"}
 
 
 @pytest.mark.parametrize(("n_sampled", "n_steps", "n"), [(128, 2, 32), (128, 1, 64), (100, 3, 17), (1, 5, 1)])

@@ -371,6 +371,19 @@ def test_the_next_batch_is_simulated_during_the_step(case, backend, make_agent, 
     assert all((n > 0) == (name == "simulate_ahead") for name, n in others)
 
 
+def test_nothing_is_simulated_for_a_replay_buffer_that_no_longer_expands(backend, make_agent):
+    env = VecNormalize(make_vec_env("InvertedPendulum-v5", 1))
+    agent = make_agent(env, search_share=0.0, value_expansion=2)
+    agent.learn(30)
+    buffer, n = agent.replay_buffer, agent.n_simulated_steps
+    assert n > 0 and buffer._ahead is not None
+    assert "_ahead" not in vars(pickle.loads(pickle.dumps(buffer)))
+    agent.value_expansion = 0
+    agent.learn(30)
+    assert agent.replay_buffer is buffer and agent.n_simulated_steps == n
+    assert "_ahead" not in vars(buffer)
+
+
 def simulate_in_plain_order(agent):
     """Simulate for the next batch after every step, by the actor as it was before the step."""
     train, sample, left = agent.train, ExpandedReplayBuffer.sample, []

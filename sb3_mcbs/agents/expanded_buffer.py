@@ -76,7 +76,7 @@ class ExpandedReplayBuffer(ReplayBuffer):
         :return: n-step transitions. Those that ended an episode are not expanded.
         """
         n_expanded = self._n_expanded(batch_size)
-        simulated = self._simulated(n_expanded, env) if n_expanded else None
+        simulated = self._simulated(n_expanded, env)
         n_own = batch_size if simulated is None else batch_size - n_expanded
         samples = []
         if n_own:
@@ -116,15 +116,18 @@ class ExpandedReplayBuffer(ReplayBuffer):
     def _settings(self, n: int, env: VecNormalize | None) -> tuple[Any, ...]:
         """What transitions that were simulated ahead depend on."""
         agent = self.expanding_agent
-        return n, env, agent, agent.planner, agent.value_expansion, agent.branch_length, agent.gamma
+        lengths = agent.value_expansion, agent.branch_length
+        return n, env, self.device, agent, agent.planner, *lengths, agent.gamma
 
     def _simulated(self, n: int, env: VecNormalize | None) -> ReplayBufferSamples | None:
-        """The simulated part of a batch.
+        """The simulated part of a batch. What was simulated ahead is used for this batch or not at all.
 
-        :param n: number of transitions.
-        :return: ``None`` if there is no stored state to branch off.
+        :param n: number of transitions; may be 0.
+        :return: ``None`` if there is nothing to simulate, or no stored state to branch off.
         """
         (settings, samples), self._ahead = self._ahead or (None, None), None
+        if not n:
+            return None
         if settings is not None and settings == self._settings(n, env):
             return samples
         return self._simulation(n, env)()
@@ -295,6 +298,7 @@ def drop_states(buffer: ReplayBuffer | None) -> None:
         return
     if isinstance(buffer, ExpandedReplayBuffer):
         del buffer.expanding_agent
+        vars(buffer).pop("_ahead", None)  # it leads to the agent, which would be pickled with the buffer
         buffer.__class__ = buffer.base_class  # type: ignore[assignment]
     kept = [name for name in ARRAYS if name in vars(buffer)]
     for name in kept:

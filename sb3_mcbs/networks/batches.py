@@ -91,7 +91,8 @@ class CopiedBatches:
         """
         with self._on_host() as buffer:
             samples = buffer.sample(self._batch_size, env=env)
-            if hasattr(buffer, "next_simulation"):
+            self._ahead = None
+            if hasattr(buffer, "next_simulation"):  # a buffer can lose it
                 self._ahead = buffer.next_simulation(self._batch_size, env)
         fields = [field.numpy().reshape(self._batch_size, -1) for field in samples if field is not None]
         widths = [field.shape[1] for field in fields]
