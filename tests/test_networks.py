@@ -1,5 +1,6 @@
 """Networks as functions on arrays, against SB3's own calls of them."""
 
+import sys
 from types import MappingProxyType
 
 import numpy as np
@@ -130,6 +131,21 @@ def test_networks_of_a_gpu_are_copied_as_they_are(cls, monkeypatch):
         np.testing.assert_array_equal(found, before)
     changed = [np.array_equal(a, b) for a, b in zip(functions()(), expected, strict=True)]
     assert not any(changed[:3])
+
+
+@pytest.mark.parametrize("cls", [SAC, TQC, CrossQ])
+def test_what_sb3s_actors_draw_with_may_be_replaced(cls, monkeypatch):
+    agent, observations = agent_of(cls), np.zeros((3, 17), dtype=np.float32)
+
+    def drawn():
+        return target_actor(agent)(observations, np.random.default_rng(0))
+
+    (actions, bonus), log_prob = drawn(), SquashedDiagGaussianDistribution.log_prob
+    monkeypatch.setattr(SquashedDiagGaussianDistribution, "log_prob", lambda *args: 2 * log_prob(*args))
+    np.testing.assert_allclose(drawn()[1], 2 * bonus, rtol=1e-4)
+    monkeypatch.undo()
+    monkeypatch.setattr(sys.modules[type(agent.actor).__module__], "LOG_STD_MAX", -19.0)
+    assert np.abs(drawn()[0] - actions).max() > 0.1
 
 
 def test_batch_renormalization_has_the_present_statistics():
