@@ -1,18 +1,18 @@
 # sb3-mcbs with RL Zoo's commands, for processors:
 #   docker build -t sb3-mcbs .
 #   mkdir -p logs
-#   docker run --rm --user "$(id -u)" -v "$PWD/logs:/work/logs" sb3-mcbs train --algo mcbs_td3 --env HalfCheetah-v5
+#   docker run --rm --user "$(id -u)" -v "$PWD/logs:/work/logs" sb3-mcbs train --algo mcbs_crossq --env HalfCheetah-v5
 # For a GPU of NVIDIA: docker build --build-arg TORCH_INDEX=https://pypi.org/simple, and docker run --gpus all.
 ARG PYTHON=3.11
 FROM python:${PYTHON}-slim
 
 ARG TORCH_INDEX=https://download.pytorch.org/whl/cpu
 
-# Rendering without a screen.
+# Rendering without a screen: by EGL, since OSMesa crashes beside a CUDA build of PyTorch.
 RUN apt-get update \
-    && apt-get install -y --no-install-recommends libosmesa6 libegl1 libgl1 \
+    && apt-get install -y --no-install-recommends libegl1 libgl1 \
     && rm -rf /var/lib/apt/lists/*
-ENV MUJOCO_GL=osmesa PYOPENGL_PLATFORM=osmesa PIP_NO_CACHE_DIR=1
+ENV MUJOCO_GL=egl PYOPENGL_PLATFORM=egl PIP_NO_CACHE_DIR=1
 
 # The large packages first, so that a change of the code does not install them again.
 COPY constraints.txt /tmp/

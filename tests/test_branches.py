@@ -138,6 +138,9 @@ def test_what_was_simulated_ahead_is_used_once_and_with_its_settings(make_agent,
         setattr(agent, name, value)
         assert n_simulated(sample) > 0
     buffer.next_simulation(16, None)()
+    agent.set_env(snapshot_vec_env("HalfCheetah-v5"))
+    assert n_simulated(sample) > 0
+    buffer.next_simulation(16, None)()
     agent.branch_length = agent.value_expansion = 0
     assert n_simulated(sample) == n_simulated(buffer.next_simulation(16, None)) == 0
     agent.value_expansion, agent.branch_length = 1, branch_length

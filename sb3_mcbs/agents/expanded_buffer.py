@@ -117,7 +117,7 @@ class ExpandedReplayBuffer(ReplayBuffer):
         """What transitions that were simulated ahead depend on."""
         agent = self.expanding_agent
         lengths = agent.value_expansion, agent.branch_length
-        return n, env, self.device, agent, agent.planner, *lengths, agent.gamma
+        return n, env, self.device, agent, agent.planner.model, *lengths, agent.gamma
 
     def _simulated(self, n: int, env: VecNormalize | None) -> ReplayBufferSamples | None:
         """The simulated part of a batch. What was simulated ahead is used for this batch or not at all.

@@ -174,7 +174,7 @@ class MLP:
             elif isinstance(layer, _Linear):
                 bias = layer.bias
                 if bias is None:
-                    bias = th.zeros(len(layer.weight), device=self.device)
+                    bias = th.zeros(len(layer.weight), dtype=th.float32, device=self.device)
                 rows.append(([*before, layer.weight, bias], 0))
                 before = []
             elif not isinstance(layer, Renormalization) and not before and not rows[-1][1]:
