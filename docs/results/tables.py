@@ -13,7 +13,7 @@ from scipy.stats import trim_mean
 
 HERE = Path(__file__).resolve().parent
 CSV, PAGE = HERE / "crossq.csv", HERE.parent / "results.md"
-RUN, POLICIES = ["experiment", "environment", "arm", "seed"], ["actor alone", "with search"]
+RUN, POLICIES = ["experiment", "environment", "arm", "seed"], ["actor alone", "actor with search"]
 #: A run's score is the mean of its evaluations from the first to the last of these steps.
 SCORED = 45_000, 60_000
 SCORE = "mean of 45,000 to 60,000"
