@@ -346,7 +346,7 @@ def test_the_next_batch_is_simulated_during_the_step(case, backend, make_agent, 
     monkeypatch.setattr(mlp, "_is_host", lambda device: False)
     cls, settings = AHEAD[case]
     # Every step moves the networks far.
-    settings = dict(policy_kwargs=TANH, value_expansion=2, learning_rate=0.01) | settings
+    settings = dict(policy_kwargs=deepcopy(TANH), value_expansion=2, learning_rate=0.01) | settings
     simulated = []
     for name in ("draw", "simulate_ahead"):
         method = getattr(CopiedBatches, name)

@@ -19,7 +19,9 @@ from sb3_mcbs.models import (
     families,
     make_forward_model,
     register_family,
+    row_arithmetic,
 )
+from sb3_mcbs.models.compiling import JIT_IS_OFF, fingerprint
 from sb3_mcbs.models.families import known_families
 from sb3_mcbs.models.row_arithmetic import (
     norm,
@@ -211,6 +213,18 @@ def test_sums_add_in_the_order_of_numpy(size: int, dtype: type) -> None:
 def test_norms_round_as_numpys() -> None:
     for vector in np.random.default_rng(0).normal(size=(2000, 3)):
         assert norm(vector) == np.linalg.norm(vector)
+
+
+@pytest.mark.skipif(JIT_IS_OFF, reason="is about compiled functions")
+def test_norms_of_other_processors_are_compiled_anew() -> None:
+    kept = {fingerprint(each) for each in (row_arithmetic._fused_norm, row_arithmetic._rounded_norm)}
+    assert len(kept) == 2
+    found = [
+        [each(vector) for vector in np.random.default_rng(0).normal(size=(200, 3))]
+        for each in (row_arithmetic._fused_norm, row_arithmetic._rounded_norm)
+    ]
+    np.testing.assert_allclose(*found, rtol=1e-15)
+    assert row_arithmetic.norm in (row_arithmetic._fused_norm, row_arithmetic._rounded_norm)
 
 
 @pytest.mark.parametrize("weight", [0.1, np.float64(0.1), np.float32(0.1), 3])

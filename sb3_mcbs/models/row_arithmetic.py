@@ -5,6 +5,7 @@ the same results.
 """
 
 import math
+from fractions import Fraction
 
 import numba
 import numpy as np
@@ -74,8 +75,28 @@ def _fused_norm(vector: np.ndarray) -> float:
     return math.sqrt(total)
 
 
-#: ``np.linalg.norm(vector)`` for short vectors: BLAS fuses multiplication and addition where it can.
-norm = np.linalg.norm if JIT_IS_OFF else _fused_norm
+@compiled
+def _rounded_norm(vector: np.ndarray) -> float:
+    total = vector[0] * vector[0]
+    for i in range(1, len(vector)):
+        total += vector[i] * vector[i]
+    return math.sqrt(total)
+
+
+def blas_fuses() -> bool:
+    """Whether NumPy's BLAS does not round products before it adds them, which depends on the processor."""
+    for vector in np.random.default_rng(0).normal(size=(100, 3)):
+        fused = rounded = 0.0
+        for value in vector.tolist():
+            fused = float(Fraction(value) ** 2 + Fraction(fused))
+            rounded += value * value
+        if fused != rounded:
+            return bool(vector.dot(vector) == fused)
+    return False
+
+
+#: ``np.linalg.norm(vector)`` for short vectors.
+norm = np.linalg.norm if JIT_IS_OFF else _fused_norm if blas_fuses() else _rounded_norm
 
 
 @compiled
