@@ -14,18 +14,13 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from sb3_contrib import TQC, CrossQ
-from sb3_contrib.crossq import policies as crossq_policies
-from sb3_contrib.tqc import policies as tqc_policies
 from stable_baselines3 import DDPG, SAC, TD3
-from stable_baselines3.common import distributions
-from stable_baselines3.common.distributions import DiagGaussianDistribution, SquashedDiagGaussianDistribution
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import obs_as_tensor
-from stable_baselines3.sac import policies as sac_policies
 
 from sb3_mcbs.networks.mlp import MLP, on_host
-from sb3_mcbs.networks.plain_networks import actor_mlp, check_unreplaced, critic_mlps
+from sb3_mcbs.networks.plain_networks import actor_mlp, critic_mlps
 from sb3_mcbs.networks.squashed_gaussian import SquashedGaussian
 from sb3_mcbs.types import Observations
 
@@ -34,20 +29,6 @@ Actor = Callable[[Observations, np.random.Generator], tuple[np.ndarray, np.ndarr
 #: Agents whose actor is a squashed Gaussian, and whose targets have an entropy term.
 STOCHASTIC = (SAC, TQC, CrossQ)
 SUPPORTED = (TD3, DDPG, *STOCHASTIC)
-#: What SB3's actors draw with; a user may replace it.
-_DRAWING = [
-    (owner, name, getattr(owner, name))
-    for owner, name in (
-        *((DiagGaussianDistribution, name) for name in ("proba_distribution", "log_prob")),
-        *((SquashedDiagGaussianDistribution, name) for name in ("proba_distribution", "log_prob")),
-        (distributions, "sum_independent_dims"),
-        *(
-            (policies, f"LOG_STD_{end}")
-            for policies in (sac_policies, tqc_policies, crossq_policies)
-            for end in ("MIN", "MAX")
-        ),
-    )
-]
 
 
 def check_agent(agent: OffPolicyAlgorithm) -> None:
@@ -173,7 +154,6 @@ def soft_policy_function(agent: OffPolicyAlgorithm) -> Actor:
     # SB3 has one of the two: the first where the coefficient is learned.
     coefficient = (own.ent_coef_tensor if own.log_ent_coef is None else own.log_ent_coef.exp()).item()
     with suppress(TypeError):
-        check_unreplaced(_DRAWING)
         actor_mlp(actor)
         return _plain_draw(SquashedGaussian(actor).on_host(), coefficient)
     if isinstance(agent, CrossQ):

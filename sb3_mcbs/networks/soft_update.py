@@ -10,12 +10,10 @@ from typing import Any
 import torch as th
 from sb3_contrib import TQC
 from sb3_contrib.common.utils import quantile_huber_loss
-from sb3_contrib.crossq import policies as crossq_policies
 from sb3_contrib.crossq.policies import Actor as CrossQActor
 from sb3_contrib.tqc import tqc as tqc_module
 from sb3_contrib.tqc.policies import Actor as TQCActor
 from stable_baselines3 import SAC
-from stable_baselines3.common import distributions
 from stable_baselines3.common.distributions import DiagGaussianDistribution, SquashedDiagGaussianDistribution
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.sac import sac as sac_module
@@ -32,7 +30,7 @@ from sb3_mcbs.networks.plain_networks import (
     check_unreplaced,
     critic_mlps,
 )
-from sb3_mcbs.networks.squashed_gaussian import LOG_SQRT_TWO_PI
+from sb3_mcbs.networks.squashed_gaussian import DRAWING, LOG_SQRT_TWO_PI
 from sb3_mcbs.networks.update import Losses, Update
 
 #: What the ``train`` methods use besides networks and optimizers; a user may replace it.
@@ -43,18 +41,14 @@ _CALLED = [
         (sac_module, "polyak_update"),
         (tqc_module, "polyak_update"),
         (tqc_module, "quantile_huber_loss"),
-        *((DiagGaussianDistribution, name) for name in ("proba_distribution", "log_prob", "sample")),
+        (DiagGaussianDistribution, "sample"),
         *(
             (SquashedDiagGaussianDistribution, name)
-            for name in ("actions_from_params", "get_actions", "log_prob_from_params")
+            for name in ("actions_from_params", "get_actions", "log_prob_from_params", "sample")
         ),
-        *((SquashedDiagGaussianDistribution, name) for name in ("proba_distribution", "log_prob", "sample")),
-        (distributions, "sum_independent_dims"),
         *((actor, "action_log_prob") for actor in (SACActor, TQCActor, CrossQActor)),
-        (crossq_policies, "LOG_STD_MIN"),
-        (crossq_policies, "LOG_STD_MAX"),
     )
-]
+] + DRAWING
 
 
 class SoftUpdate(Update):

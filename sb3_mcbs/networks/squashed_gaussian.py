@@ -5,11 +5,32 @@ from copy import copy
 from typing import Any, NamedTuple
 
 import torch as th
+from sb3_contrib.crossq import policies as crossq_policies
+from sb3_contrib.tqc import policies as tqc_policies
+from stable_baselines3.common import distributions
+from stable_baselines3.common.distributions import DiagGaussianDistribution, SquashedDiagGaussianDistribution
+from stable_baselines3.sac import policies as sac_policies
 from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN
 
 from sb3_mcbs.networks.mlp import MLP, Pass, on_host
+from sb3_mcbs.networks.plain_networks import check_unreplaced
 
 LOG_SQRT_TWO_PI = math.log(math.sqrt(2 * math.pi))
+#: What SB3's actors draw with; a user may replace it.
+DRAWING = [
+    (owner, name, getattr(owner, name))
+    for owner, name in (
+        *((DiagGaussianDistribution, name) for name in ("proba_distribution", "log_prob")),
+        *((SquashedDiagGaussianDistribution, name) for name in ("proba_distribution", "log_prob")),
+        (distributions, "sum_independent_dims"),
+    )
+]
+#: Where they find the limits of :data:`LOG_STD_MIN` and :data:`LOG_STD_MAX`.
+_LIMITS = [
+    (policies, name, getattr(policies, name))
+    for policies in (sac_policies, tqc_policies, crossq_policies)
+    for name in ("LOG_STD_MIN", "LOG_STD_MAX")
+]
 
 
 class Sampled(NamedTuple):
@@ -37,13 +58,15 @@ class SquashedGaussian:
     """An actor whose layers are those of an :class:`MLP`, to be called without autograd.
 
     :param actor: of SAC, TQC or CrossQ, of which :func:`~.plain_networks.actor_mlp` can be made.
-    :raises TypeError: if it normalizes behind the latent layers, or has none.
+    :raises TypeError: if it normalizes behind the latent layers, or has none, or if what SB3 draws with was
+        replaced.
 
     :ivar act_dim: dimensions of an action.
     :ivar latent: the layers below mean and standard deviation.
     """
 
     def __init__(self, actor: Any) -> None:
+        check_unreplaced([*DRAWING, *_LIMITS])
         self._epsilon: float = actor.action_dist.epsilon
         self.act_dim: int = actor.action_dist.action_dim
         self.latent, self._mean, self._log_std = MLP(actor.latent_pi), MLP(actor.mu), MLP(actor.log_std)

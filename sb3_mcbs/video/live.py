@@ -1,7 +1,6 @@
 """A live view in the browser: MuJoCo's Studio, with the rollouts of every decision."""
 
 import contextlib
-import copy
 import signal
 import subprocess
 import sys
@@ -15,7 +14,7 @@ import numpy as np
 from sb3_mcbs.snapshot import SnapshotEnvWrapper
 from sb3_mcbs.video.bodies import find_bodies, mujoco_data
 from sb3_mcbs.video.looks import Look
-from sb3_mcbs.video.scene import Magnifier, RenderingError, extend_floors, ways_of
+from sb3_mcbs.video.scene import Magnifier, RenderingError, drawn_model, ways_of
 
 #: The most lines that the Studio draws.
 MOST_LINES = 1024
@@ -48,7 +47,7 @@ class LiveScene:
             raise RenderingError("A live view needs an environment that MuJoCo simulates.")
         if int(mujoco.__version__.partition(".")[0]) < 4:
             raise RenderingError(f"A live view needs MuJoCo 4; this is {mujoco.__version__}.")
-        model = _drawn_model(self._source)
+        model = drawn_model(self._source)
         body = find_bodies(model, [])[0]
         self._size = _size(model, body)
         camera = {"trackbodyid": body, "distance": _DISTANCE * self._size, "elevation": -20.0}
@@ -92,7 +91,7 @@ class LiveScene:
         data: Any = mujoco_data(self._env)
         model = None
         if data is not self._source:  # some environments make a new simulator in each episode
-            self._source, model = data, _drawn_model(data)
+            self._source, model = data, drawn_model(data)
         everything = mujoco.mjtState.mjSTATE_INTEGRATION
         state = np.empty(mujoco.mj_stateSize(data.model, everything))
         mujoco.mj_getState(data.model, data, state, everything)
@@ -144,12 +143,6 @@ class LiveScene:
                 steps = zip(way[:-1, body], way[1:, body], strict=True)
                 found += [np.array([*start, *end, *style]) for start, end in steps]
         return np.array(found[:MOST_LINES]).reshape(-1, 10)
-
-
-def _drawn_model(data: Any) -> Any:
-    model = copy.deepcopy(data.model)
-    extend_floors(model)
-    return model
 
 
 def _size(model: Any, body: int) -> float:

@@ -165,11 +165,9 @@ class MujocoScene:
     def _follow_environment(self) -> None:
         self.close()
         self._data = mujoco_data(self._env)
-        # The environment's own model keeps its size of pictures, since snapshots compare models.
-        self._model = copy.deepcopy(self._data.model)
+        self._model = drawn_model(self._data)
         width, height = self._size
         self._model.vis.global_.offwidth, self._model.vis.global_.offheight = width, height
-        extend_floors(self._model)
         self._gl, self._context = _open_gl(self._model, self._size)
         self._option = mujoco.MjvOption()
         self._scene = mujoco.MjvScene(self._model, maxgeom=10_000)
@@ -277,7 +275,17 @@ def _round_number(value: float) -> float:
     return power * max(digit for digit in (1, 2, 5) if digit * power <= value * (1 + 1e-9))
 
 
-def extend_floors(model: Any) -> None:
+def drawn_model(data: Any) -> Any:
+    """A copy of a simulator's model, to be changed for drawing: snapshots compare the environment's own one.
+
+    :param data: the simulator's ``MjData``.
+    """
+    model = copy.deepcopy(data.model)
+    _extend_floors(model)
+    return model
+
+
+def _extend_floors(model: Any) -> None:
     """Draw large floors without end: agents run beyond them, since they have none in the simulation."""
     floors = (model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) & (model.geom_size[:, :2].min(axis=1) >= 10)
     for floor in np.flatnonzero(floors):
