@@ -14,7 +14,8 @@ from sb3_mcbs.experiments.report.content import number
 from sb3_mcbs.experiments.report.curves import curve_pictures
 from sb3_mcbs.experiments.report.page import Section, sections
 from sb3_mcbs.experiments.report.references import paper_beam, paper_finals, published_curves
-from sb3_mcbs.experiments.report.runs import Competitor, load_results
+from sb3_mcbs.experiments.report.runs import Competitor
+from sb3_mcbs.experiments.report.sources import load_results
 from sb3_mcbs.experiments.report.statistics import (
     common_step,
     final_estimate,
@@ -139,6 +140,7 @@ def test_curves_end_where_a_run_ends_and_show_every_seed(folder: Path) -> None:
     pictures = {picture.name: picture for picture in curve_pictures(results, CHEETAH)}
     assert list(pictures) == [f"curves-{CHEETAH}-{axis}" for axis in ("steps", "simulated", "time")]
     assert "mcbs_td3: with search ends at 10,000 after 300 steps" in pictures[f"curves-{CHEETAH}-steps"].alt
+    assert "1k<" in pictures[f"curves-{CHEETAH}-simulated"].drawing.svg  # and no markup of a logarithm
     simulated = rows_of(pictures[f"curves-{CHEETAH}-simulated"].table)["300"]
     assert simulated["mcbs_td3: alone, steps of the environment and of the search"] == "3,300"
     time = rows_of(pictures[f"curves-{CHEETAH}-time"].table)["300"]
@@ -191,7 +193,7 @@ def test_a_grid_around_a_trained_agent(tmp_path: Path) -> None:
     }
     assert rows_of(paper.table)["1"]["D = 6"] == "–"
     assert not any("improvement" in line for part in sections(results) for line in part.text)
-    lines = report(tmp_path / "frozen", tmp_path / "out")
+    lines = report(tmp_path / "frozen", output=tmp_path / "out")
     assert lines[:2] == ["5 runs, 5 finished", "sac:"] and "actor" in lines[2]
     text = check_page(tmp_path / "out" / "report.html")
     assert "Learning curves" not in text and "nothing was trained" in text
@@ -205,7 +207,7 @@ def test_a_grid_around_a_trained_agent(tmp_path: Path) -> None:
 
 
 def test_the_page_and_its_files(folder: Path, tmp_path: Path) -> None:
-    lines = report(folder, tmp_path)
+    lines = report(folder, output=tmp_path)
     assert lines[0] == "12 runs, 10 finished" and lines[-1] == f"Report: {tmp_path / 'report.html'}"
     assert "  td3: alone                       4,000 (3,000 to 5,000), 3 runs" in lines
     text = check_page(tmp_path / "report.html")
@@ -225,9 +227,10 @@ def test_the_page_and_its_files(folder: Path, tmp_path: Path) -> None:
         evaluations = list(csv.DictReader(file))
     assert len(evaluations) == 6 * 3 + 2 * (4 * 3 + 2)
     assert evaluations[0] == {
-        "run": "td3_HalfCheetah-v5_0", "policy": "actor alone", "timesteps": "100", "simulated_steps": "0",
-        "seconds": "3600.0", "mean_return": "1000.0", "return_0": "999.0", "length_0": "1000",
-        "return_1": "1001.0", "length_1": "1000",
+        "run": "td3_HalfCheetah-v5_0", "arm": "td3", "task": CHEETAH, "environment": CHEETAH,
+        "seed": "0", "state": "finished", "settings": '{"algorithm": "td3"}', "policy": "actor alone",
+        "timesteps": "100", "simulated_steps": "0", "seconds": "3600.0", "mean_return": "1000.0",
+        "return_0": "999.0", "length_0": "1000", "return_1": "1001.0", "length_1": "1000",
     }  # fmt: skip
 
 
@@ -242,7 +245,7 @@ def test_the_same_report_twice(folder: Path) -> None:
 
 
 def test_logs_of_another_algorithm(tmp_path: Path) -> None:
-    lines = report(zoo(tmp_path / "logs"), tmp_path / "report")
+    lines = report(zoo(tmp_path / "logs"), output=tmp_path / "report")
     assert lines[:3] == [
         "2 runs, 2 finished",
         "Hopper-v5, interquartile mean after 100000 steps:",
@@ -288,7 +291,7 @@ def test_the_run_of_an_experiment_is_one_run(tmp_path: Path) -> None:
     evaluate(place, [1.0, 2.0, 3.0], [2.0, 3.0, 4.0])
     training = place.training(place.run())
     (training / f"{CHEETAH}.zip").touch()
-    lines = report(place.path, tmp_path / "report")
+    lines = report(place.path, output=tmp_path / "report")
     assert lines[1] == "Mean return of the actor with search: 4.0 (2 episodes after 300 steps)"
     assert lines[2:4] == [f"Model:          {training / CHEETAH}.zip", f"Logs:           {training}"]
 
@@ -296,9 +299,9 @@ def test_the_run_of_an_experiment_is_one_run(tmp_path: Path) -> None:
 def test_the_baseline_can_be_chosen(tmp_path: Path) -> None:
     zoo(zoo(tmp_path, "a2c"), "ppo")
     assert load_results(tmp_path).competitors[0].arm == "a2c"
-    assert load_results(tmp_path, "ppo").competitors[0].arm == "ppo"
+    assert load_results(tmp_path, baseline="ppo").competitors[0].arm == "ppo"
     with pytest.raises(PathError, match=r"There is no arm 'td3' with evaluations in .*, only a2c, ppo"):
-        load_results(tmp_path, "td3")
+        load_results(tmp_path, baseline="td3")
 
 
 def test_machines_of_runs(tmp_path: Path) -> None:

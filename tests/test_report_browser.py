@@ -55,7 +55,7 @@ def page(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
         for number in range(8):
             arm = f"mcbs_td3-with-a-name-that-says-all-of-it-{number}-beam_width=6-rollout_depth=3"
             evaluate(add_run(folder, arm, "HalfCheetah-v5", 0), [1e3, 2e4, 3e5], [1e3, 2e4, 3e5])
-    report(folder, folder / "report")
+    report(folder, output=folder / "report")
     return (folder / "report" / "report.html").read_text(encoding="utf-8")
 
 

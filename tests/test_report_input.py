@@ -12,7 +12,8 @@ from sb3_mcbs import cli
 from sb3_mcbs.experiments.report import statistics
 from sb3_mcbs.experiments.report.command import report
 from sb3_mcbs.experiments.report.page import sections
-from sb3_mcbs.experiments.report.runs import Competitor, load_results
+from sb3_mcbs.experiments.report.runs import Competitor
+from sb3_mcbs.experiments.report.sources import load_results
 from sb3_mcbs.experiments.report.statistics import final_estimate, finals
 from sb3_mcbs.experiments.report.tables import episode_table
 from sb3_mcbs.zoo.evaluations import ACTOR
@@ -47,7 +48,7 @@ def test_a_run_that_was_first_evaluated_later_is_not_compared(tmp_path: Path) ->
 def test_names_are_escaped(tmp_path: Path) -> None:
     (tmp_path / "spec.yml").write_text("# <b>&\n")
     evaluate(add_run(tmp_path, "td3", CHEETAH, 0), [1.0, 2.0, 3.0])
-    report(tmp_path, tmp_path / "report")
+    report(tmp_path, output=tmp_path / "report")
     assert "# &lt;b&gt;&amp;" in check_page(tmp_path / "report" / "report.html")
 
 
@@ -55,7 +56,7 @@ def test_names_of_folders_are_no_markup(tmp_path: Path) -> None:
     names = ("a$_{$b", "<b>\"&'", "{{7*7}}", "_x")
     for name in names:
         zoo(tmp_path / "logs", name)
-    report(tmp_path / "logs", tmp_path / "report")
+    report(tmp_path / "logs", output=tmp_path / "report")
     text = check_page(tmp_path / "report" / "report.html")
     assert "<b>" not in re.sub(r"<li><b>", "", text) and "{{7*7}}: alone" in text and "a$_{$b: alone" in text
 
@@ -63,7 +64,7 @@ def test_names_of_folders_are_no_markup(tmp_path: Path) -> None:
 def test_a_broken_file_is_named_and_the_others_are_reported(tmp_path: Path) -> None:
     broken = zoo(tmp_path / "logs", runs=3) / "ppo" / "Hopper-v5_2" / "evaluations.npz"
     broken.write_bytes(b"PK no archive")
-    lines = report(tmp_path / "logs", tmp_path / "report")
+    lines = report(tmp_path / "logs", output=tmp_path / "report")
     assert any(str(broken) in line and "is not what an EvalCallback writes" in line for line in lines)
     assert lines[2].endswith("200, 2 runs")
     assert "Could not be used" in check_page(tmp_path / "report" / "report.html")

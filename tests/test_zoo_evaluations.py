@@ -55,7 +55,7 @@ def test_report_says_what_was_reached_and_where_it_lies(logs: Path) -> None:
     folder = logs / "mcbs_td3" / "HalfCheetah-v5_1"
     for name in ("best_model", "HalfCheetah-v5"):
         (folder / f"{name}.zip").touch()
-    lines = report(folder, folder / "report")
+    lines = report(folder, output=folder / "report")
     assert lines[0] == "Mean return of the actor alone: 20.0 (2 episodes after 200 steps)"
     assert lines[1] == "Mean return of the actor with search: 30.0 (2 episodes after 200 steps)"
     assert lines[2].endswith("HalfCheetah-v5.zip")
@@ -81,7 +81,7 @@ def test_newest_run_is_the_one_evaluated_last(logs: Path) -> None:
 
 def test_run_without_evaluations_is_named(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="--eval-freq"):
-        report(tmp_path, tmp_path / "report")
+        report(tmp_path, output=tmp_path / "report")
     assert not (tmp_path / "report").exists()
 
 

@@ -1,25 +1,31 @@
-"""Writes the tables of ``docs/results.md`` between its markers, from ``crossq.csv``.
+"""Writes the tables and curves of ``docs/results.md`` and ``docs/results/README.md``.
 
-``python docs/results/tables.py [EVALUATIONS.CSV ...]`` first adds files of that name that ``sb3-mcbs report``
-wrote, in the place of earlier evaluations of the same runs.
+They are made from ``evaluations.csv``, which has every episode, and from ``screens.csv``, which has the means
+of runs whose episodes were not kept. To add runs, replace ``evaluations.csv`` by the file of that name that
+``sb3-mcbs report docs/results/evaluations.csv FOLDER -o NEW`` writes.
 """
 
-import sys
 from pathlib import Path
 from typing import NamedTuple
 
 import pandas as pd
 from scipy.stats import trim_mean
 
+from sb3_mcbs.experiments.report.curves import curve_pictures
+from sb3_mcbs.experiments.report.references import published_curves
+from sb3_mcbs.experiments.report.sources import load_results
+
 HERE = Path(__file__).resolve().parent
-CSV, PAGE = HERE / "crossq.csv", HERE.parent / "results.md"
 RUN, POLICIES = ["experiment", "environment", "arm", "seed"], ["actor alone", "actor with search"]
 #: A run's score is the mean of its evaluations from the first to the last of these steps.
 SCORED = 45_000, 60_000
 SCORE = "mean of 45,000 to 60,000"
 #: The order of the rows.
 ENVIRONMENTS = ["HalfCheetah-v5", "Walker2d-v5", "Hopper-v5", "Ant-v5"]
-ARMS = ["mcbs_crossq", "no-search", "crossq", "crossq-n3", "crossq-delay-1", "crossq-1024"]
+ARMS = ["td3", "mcbs_td3-paper", "mcbs_td3-stored", "mcbs_crossq", "no-search", "crossq", "crossq-n3"]
+#: Arms of the pictures, and patterns of those in the tables.
+CURVES = ["td3", "mcbs_td3-paper", "crossq", "no-search", "mcbs_crossq"]
+ON_CROSSQ, ON_TD3 = "(?!td3|mcbs_td3).*", "(td3|mcbs_td3).*"
 
 
 class Table(NamedTuple):
@@ -27,14 +33,14 @@ class Table(NamedTuple):
 
     :param experiment: of the runs.
     :param steps: columns.
-    :param arms: a pattern, where only some are shown.
+    :param arms: a pattern.
     :param others: whether the environments are those other than HalfCheetah, which have a column then.
     :param scored: whether there is a column of scores.
     """
 
     experiment: str
     steps: list[int]
-    arms: str = ".*"
+    arms: str = ON_CROSSQ
     others: bool = False
     scored: bool = False
 
@@ -43,21 +49,20 @@ TABLES = {
     "protocol": Table("protocol", [15_000, 30_000, 45_000, 60_000, 100_000], scored=True),
     "environments": Table("protocol", [20_000, 30_000, 45_000, 60_000, 80_000, 100_000], others=True),
     "screens": Table("screen", [10_000, 20_000, 30_000, 40_000], others=True),
-    "screen": Table("screen", [10_000, 15_000, 30_000, 45_000, 60_000], arms="(?!mcbs_td3).*", scored=True),
-    "td3": Table("screen", [15_000, 20_000, 25_000, 30_000], arms="mcbs_td3.*"),
+    "screen": Table("screen", [10_000, 15_000, 30_000, 45_000, 60_000], scored=True),
+    "td3": Table("screen", [15_000, 20_000, 25_000, 30_000], arms=ON_TD3),
+    "on-td3": Table("protocol", [20_000, 40_000, 60_000, 80_000, 100_000, 200_000, 300_000], arms=ON_TD3),
 }
 
 
-def read_report(path: str) -> pd.DataFrame:
-    """Read the ``evaluations.csv`` of a report, as rows of ``crossq.csv``."""
-    rows = pd.read_csv(path)
+def read() -> pd.DataFrame:
+    """All evaluations, with their means and standard deviations."""
+    rows = pd.read_csv(HERE / "evaluations.csv")
     returns = rows.filter(regex=r"^return_\d+$")
-    found = rows["run"].str.extract(r"(?P<arm>.+)_(?P<environment>.+)_(?P<seed>\d+)").astype({"seed": int})
-    found["experiment"], found["policy"] = "protocol", rows["policy"]
-    found["step"] = rows["timesteps"].round(-3)  # several environments step at once
-    found["mean"], found["std"] = returns.mean(axis=1).round(1), returns.std(axis=1, ddof=0).round(1)
-    found["episodes"], found["simulated_steps"] = returns.count(axis=1), rows["simulated_steps"]
-    return found
+    rows["experiment"] = "protocol"
+    rows["step"] = rows["timesteps"].round(-3)  # several environments step at once
+    rows["mean"], rows["std"] = returns.mean(axis=1), returns.std(axis=1, ddof=0)
+    return pd.concat([rows, pd.read_csv(HERE / "screens.csv")])
 
 
 def cells(returns: pd.DataFrame) -> pd.Series:
@@ -70,8 +75,14 @@ def cells(returns: pd.DataFrame) -> pd.Series:
     return joined.where(returns.notna().all(axis=1), "")
 
 
-def rows_of(table: Table, data: pd.DataFrame) -> str:
-    """A table in Markdown.
+def markdown(columns: pd.DataFrame) -> str:
+    """A table in Markdown."""
+    lines = [columns.columns, ["---"] * columns.shape[1], *columns.fillna("").to_numpy()]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def returns_table(table: Table, data: pd.DataFrame) -> str:
+    """Returns by steps.
 
     :param table: what it shows.
     :param data: all evaluations.
@@ -94,8 +105,7 @@ def rows_of(table: Table, data: pd.DataFrame) -> str:
     columns = columns.sort_values(["environment", "place", "arm"], kind="stable").drop(columns="place")
     columns["environment"] = columns["environment"].astype(str).str.replace(r"-v\d", "", regex=True)
     columns["arm"] = columns["arm"].str.replace(r"^[^ ]+", r"`\g<0>`", regex=True)
-    lines = [columns.columns, ["---"] * columns.shape[1], *columns.fillna("").to_numpy()]
-    return "\n".join(f"| {' | '.join(line if table.others else line[1:])} |" for line in lines)
+    return markdown(columns if table.others else columns.drop(columns="environment"))
 
 
 def scores_of(returns: pd.DataFrame) -> pd.DataFrame:
@@ -119,23 +129,65 @@ def summaries(scores: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(found, columns=["environment", "arm", "seed", SCORE])
 
 
+def reached_table(data: pd.DataFrame) -> str:
+    """When ``mcbs_crossq`` first returns what TD3's actor does after 300,000 steps."""
+    rows = []
+    runs = data[(data["experiment"] == "protocol") & (data["arm"] == "mcbs_crossq")]
+    for (environment, seed), run in runs.groupby(["environment", "seed"]):
+        ours = data[(data["run"] == f"td3_{environment}_0") & (data["policy"] == POLICIES[0])]
+        (zoo,) = [curve for curve in published_curves(environment) if curve.name == "RL Zoo TD3"]
+        targets = {
+            "RL Zoo's": zoo.returns[zoo.steps == 300_000].item(),
+            "ours": ours.loc[ours["step"] == 300_000, "mean"].squeeze() if len(ours) else None,
+        }
+        row = {"environment": environment.removesuffix("-v5"), "seed": str(seed)}
+        for policy in POLICIES:
+            for whose, target in targets.items():
+                row[f"{policy.replace('actor ', '')}: {whose}"] = first(run[run["policy"] == policy], target)
+        rows.append(row)
+    return markdown(pd.DataFrame(rows))
+
+
+def first(evaluations: pd.DataFrame, target: float | None) -> str:
+    """Steps and minutes until the first evaluation that reaches a return.
+
+    :param evaluations: of one policy of a run.
+    :param target: the return; ``None``: nobody knows it.
+    """
+    if target is None:
+        return "–"
+    reached = evaluations[evaluations["mean"] >= target]
+    if reached.empty:
+        return f"not by {evaluations['step'].max():,.0f}"
+    earliest = reached.loc[reached["step"].idxmin()]
+    return f"{earliest['step']:,.0f} ({earliest['seconds'] / 60:.0f} min)"
+
+
 def with_tables(page: str, data: pd.DataFrame) -> str:
     """A page with the present tables between its markers."""
-    for name, table in TABLES.items():
-        before, rest = page.split(f"<!-- {name} -->\n")
-        _, after = rest.split(f"\n<!-- end of {name} -->")
-        page = f"{before}<!-- {name} -->\n\n{rows_of(table, data)}\n\n<!-- end of {name} -->{after}"
+    texts = {name: returns_table(table, data) for name, table in TABLES.items()}
+    texts["reached"] = reached_table(data)
+    for name, text in texts.items():
+        if f"<!-- {name} -->" in page:
+            before, rest = page.split(f"<!-- {name} -->\n")
+            _, after = rest.split(f"\n<!-- end of {name} -->")
+            page = f"{before}<!-- {name} -->\n\n{text}\n\n<!-- end of {name} -->{after}"
     return page
 
 
-def main(reports: list[str]) -> None:
-    """Add reports to the CSV file, and rewrite the page."""
-    data = pd.concat([pd.read_csv(CSV), *map(read_report, reports)])
-    key = [*RUN, "policy", "step"]
-    data = data.drop_duplicates(key, keep="last").sort_values(key)
-    data.to_csv(CSV, index=False)
-    PAGE.write_text(with_tables(PAGE.read_text(), data))
+#: Where tables stand.
+PAGES = [HERE.parent / "results.md", HERE / "README.md"]
+
+
+def main() -> None:
+    """Rewrite the pages and the curves."""
+    data = read()
+    for page in PAGES:
+        page.write_text(with_tables(page.read_text(), data))
+    results = load_results(HERE / "evaluations.csv", arms=CURVES)
+    for picture in curve_pictures(results, "HalfCheetah-v5"):
+        (HERE / f"{picture.name}.png").write_bytes(picture.drawing.png)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

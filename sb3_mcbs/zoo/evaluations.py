@@ -89,14 +89,27 @@ def load_evaluations(folder: str | Path) -> Evaluations:
     try:
         with np.load(path) as data:
             arrays = {name: np.asarray(data[key]) for key, (name, _) in _ARRAYS.items() if key in data}
-            _check(arrays)
     except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
         raise PathError(f"{path} is not what an EvalCallback writes: {error}") from error
+    return checked_evaluations(arrays, path)
+
+
+def checked_evaluations(arrays: dict[str, np.ndarray], source: str | Path) -> Evaluations:
+    """
+    :param arrays: attributes of :class:`Evaluations` by name
+    :param source: what they were read from
+    :return: the same as an object
+    :raises PathError: if an array is missing or has the wrong shape, or a return is no finite number
+    """
+    try:
+        _check(arrays)
+    except (ValueError, KeyError) as error:
+        raise PathError(f"The evaluations in {source} cannot be used: {error}") from error
     found = Evaluations(**arrays)
     broken = np.flatnonzero(~np.isfinite(found.means))
     if broken.size:
         raise PathError(
-            f"{path} has returns that are not finite numbers, first after {found.timesteps[broken[0]]} "
+            f"{source} has returns that are not finite numbers, first after {found.timesteps[broken[0]]} "
             "steps: the run diverged."
         )
     return found

@@ -180,9 +180,11 @@ def draw_curves(
             axes.plot(x, y, color=MUTED, linewidth=1.2, linestyle=":", marker=".", zorder=1)
         _name_ends(axes, published)
         axes.set(xlabel=xlabel, ylabel="return")
-        if not log:
-            axes.xaxis.set_major_formatter(matplotlib.ticker.FuncFormatter(lambda value, _: tick(value)))
+        if log:  # few decades would have labels between them too
+            axes.xaxis.set_minor_formatter(matplotlib.ticker.NullFormatter())
+        else:
             axes.xaxis.set_major_locator(matplotlib.ticker.MaxNLocator(6))
+        axes.xaxis.set_major_formatter(matplotlib.ticker.FuncFormatter(lambda value, _: tick(value)))
         axes.yaxis.set_major_formatter(matplotlib.ticker.FuncFormatter(lambda value, _: tick(value)))
         axes.grid()
         handles = [

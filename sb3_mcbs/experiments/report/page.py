@@ -114,7 +114,7 @@ def _kind(results: Results) -> str:
         return "An experiment with trained agents: nothing was trained."
     if results.spec is not None:
         return "An experiment: arms, environments and seeds of one spec."
-    return "Runs of RL Zoo." if len(results.runs) > 1 else "One run."
+    return "Several runs." if len(results.runs) > 1 else "One run."
 
 
 def _facts(results: Results) -> list[tuple[str, str]]:

@@ -47,7 +47,7 @@ class Result:
     :param environment: id
     :param seed: None: nobody recorded it
     :param state: finished, failed, unfinished or not started
-    :param folder: RL Zoo's folder of the run
+    :param folder: RL Zoo's folder of the run, or the file that it was read from
     :param policies: evaluations by policy; empty: there are none yet
     :param settings: hyperparameters that were given for this arm
     :param machines: what it ran on, with the versions of packages
@@ -138,14 +138,13 @@ def short(arm: str) -> str:
     return arm.replace("-beam_width=", " B=").replace("-rollout_depth=", " D=")
 
 
-def load_results(folder: Path, baseline: str | None = None) -> Results:
+def load_folder(folder: Path) -> Results:
     """
     Read what is in a folder.
 
     :param folder: of an experiment or of one of its runs, RL Zoo's log folder or one of its runs
-    :param baseline: the arm that the others are compared with; None: the first
     :return: its runs; those that cannot be read are named among the problems
-    :raises PathError: if nothing in it has been evaluated, or there is no such arm
+    :raises PathError: if nothing in it has been evaluated
     """
     definitions = sorted(folder.glob("runs/*/run.yml")) or sorted(folder.glob("run.yml"))
     evaluated = sorted(folder.glob("*/*_[0-9]*/evaluations.npz"))
@@ -158,13 +157,6 @@ def load_results(folder: Path, baseline: str | None = None) -> Results:
     if not results.evaluated:
         reasons = "\n".join(results.problems) or "Its runs have not come to an evaluation yet."
         raise PathError(f"There is nothing to report in {folder}. {reasons}")
-    if baseline is not None:
-        arms = list(dict.fromkeys(run.arm for run in results.evaluated))
-        if baseline not in arms:
-            raise PathError(
-                f"There is no arm {baseline!r} with evaluations in {folder}, only {', '.join(arms)}."
-            )
-        results.runs.sort(key=lambda run: run.arm != baseline)
     return results
 
 
