@@ -199,14 +199,19 @@ def not_covered(agent: object, env: object) -> None:
 
 @pytest.mark.parametrize("cls", [MCBSTD3, MCBSDDPG])
 @pytest.mark.parametrize("normalized", [False, True])
-def test_compiled_expansion_is_that_of_the_loop(cls, normalized, monkeypatch) -> None:
+@pytest.mark.parametrize("own_critics", [False, True])  # which targets do not need until they bootstrap
+def test_compiled_expansion_is_that_of_the_loop(cls, normalized, own_critics, monkeypatch) -> None:
     vec_env = DummyVecEnv([lambda: gym.make("Hopper-v5")])
     if normalized:
         vec_env = VecNormalize(vec_env)
     agent = cls(
         "MlpPolicy", vec_env, seed=1, value_expansion=3, rollout_depth=1, search_share=0.0, **deepcopy(SMALL)
     )
+    if own_critics:
+        for critic in (*agent.critic.q_networks, *agent.critic_target.q_networks):
+            critic[1] = th.nn.ELU()
     agent.learn(60)
+    assert agent._expansion_in_words() == "; expanded targets are compiled"
     batches = []
     for compiled in (True, False):
         if not compiled:

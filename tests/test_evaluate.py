@@ -14,6 +14,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_mcbs import MCBSTD3, SearchPolicy, load_agent, save_statistics
+from sb3_mcbs.agents import episodes
 from sb3_mcbs.video import Outcome
 from sb3_mcbs.zoo import evaluate
 from sb3_mcbs.zoo.environments import find_environment
@@ -42,6 +43,18 @@ def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
 @pytest.fixture
 def agent(make_agent: Any, tmp_path: Path) -> Path:
     return save_agent(make_agent, tmp_path, TQC, env=find_environment(BALL)())[1]
+
+
+def test_an_episode_that_has_no_end_is_named(
+    make_agent: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    agent, env = make_agent("Pendulum-v1"), make_vec_env("Pendulum-v1")
+    monkeypatch.setattr(episodes, "LONG", 201)
+    episodes.play(agent, env, 3)
+    assert not caplog.text
+    monkeypatch.setattr(episodes, "LONG", 150)
+    assert episodes.play(agent, env, 3).length == 200
+    assert caplog.text.count("reset seed 3 has had no end for 150 steps") == 1 and "TimeLimit" in caplog.text
 
 
 def test_both_policies_play_the_same_episodes(command: Any, agent: Path) -> None:

@@ -36,9 +36,9 @@ class CompiledPolicy:
         if not isinstance(model, MujocoBatchModel):
             raise TypeError(f"the forward model is {model.kind!r}, not 'mujoco'")
         self._model, self._view = model, view
-        actor, critics = actor_mlp(actor_of(agent, target)), critic_mlps(agent.policy.critic)
+        critics = [] if target else critic_mlps(agent.policy.critic)
         #: The arrays are valid as long as the weights live.
-        self._arrays, self._weights = policy_arrays(agent, view, actor, [] if target else critics)
+        self._arrays, self._weights = policy_arrays(agent, view, actor_mlp(actor_of(agent, target)), critics)
 
     def policy(self, observations: Any) -> np.ndarray:
         """The actor's actions ``[rows, act_dim]`` for observations of the environment."""

@@ -1,10 +1,16 @@
 """Plays episodes with given reset seeds, and counts what they cost."""
 
+import logging
 import time
 from typing import Any, NamedTuple
 
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv
+
+logger = logging.getLogger("sb3_mcbs")
+
+#: Steps of an episode after which a warning says that it may have no end.
+LONG = 100_000
 
 
 class Episode(NamedTuple):
@@ -32,10 +38,18 @@ def play(policy: Any, env: VecEnv, seed: int, deterministic: bool = True) -> Epi
     :param seed: that it is reset with.
     :param deterministic: whether actions are.
     """
-    simulated_steps = 0
+    length = simulated_steps = 0
 
     def count(*_: Any) -> None:
-        nonlocal simulated_steps
+        nonlocal length, simulated_steps
+        length += 1
+        if length == LONG:
+            logger.warning(
+                "The episode with reset seed %d has had no end for %d steps. If the environment never ends "
+                "one, wrap it in gymnasium.wrappers.TimeLimit, or register it with max_episode_steps.",
+                seed,
+                LONG,
+            )
         result = getattr(policy, "last_result", None)
         simulated_steps += 0 if result is None else int(result.simulated_steps)
 
