@@ -15,7 +15,7 @@ from sb3_mcbs.agents.schedule import ScheduleSettings
 from sb3_mcbs.agents.value_expansion import EXPANSION
 from sb3_mcbs.search import BeamSettings, SearchSettings, with_preset
 from sb3_mcbs.search.checks import as_dict
-from sb3_mcbs.search.settings import STRATEGIES, present_name
+from sb3_mcbs.search.settings import STRATEGIES, merged, present_name
 from sb3_mcbs.types import Backend, MatmulPrecision, Preset, ScheduleName, SearchUnit, Strategy
 
 #: An agent's constructor parameters besides SB3's, and their defaults without a preset. The agent has them as
@@ -198,6 +198,26 @@ def group_flat(attributes: dict[str, Any]) -> None:
     for group, values in found.items():
         if attributes.get(group) is None:  # otherwise it was given when loading
             attributes[group] = values
+
+
+def settings_to_load(given: Mapping[str, Any]) -> dict[str, Any]:
+    """The keywords of ``load``, with all settings that they replace in the file.
+
+    :param given: keywords; a ``preset`` replaces all settings of the search that are not among them.
+    :return: keywords for SB3's ``load``.
+    :raises TypeError: if one has a name of older versions.
+    """
+    kwargs = {name: value for name, value in given.items() if value is not None or name not in OF_PRESETS}
+    objects = kwargs.get("custom_objects") or {}
+    refuse_old_names({**{name: objects[name] for name in MOVED.keys() & objects.keys()}, **kwargs})
+    explicit = {**{name: objects[name] for name in SETTINGS.keys() & objects.keys()}, **kwargs}
+    if explicit.get("preset") is not None:
+        kwargs = merged(settings_of_preset(explicit["preset"]), explicit)
+        kwargs |= decide_expansion(kwargs)
+    elif not explicit.keys().isdisjoint(EXPANSION):
+        kwargs["expansion_where_possible"] = None
+    # Older files have the keys of these as attributes, which None would leave in place.
+    return {name: {} if name in GROUPS and value is None else value for name, value in kwargs.items()}
 
 
 @contextmanager

@@ -2,7 +2,7 @@
 
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from copy import copy
 from typing import Any, ClassVar, TypeVar
 
@@ -18,13 +18,12 @@ from sb3_mcbs.agents.exploration import DrawnNoise, noise_without_search
 from sb3_mcbs.agents.faults import environment_named
 from sb3_mcbs.agents.hyperparameters import (
     GROUPS,
-    MOVED,
     SETTINGS,
     SearchAttributes,
     complete_settings,
     convert_older,
     moved_modules,
-    refuse_old_names,
+    settings_to_load,
     tidied,
 )
 from sb3_mcbs.agents.learned_model import (
@@ -34,16 +33,14 @@ from sb3_mcbs.agents.learned_model import (
     set_up_learned_model,
 )
 from sb3_mcbs.agents.planner import Planner
-from sb3_mcbs.agents.presets import OF_PRESETS, decide_expansion, settings_of_preset
 from sb3_mcbs.agents.resumable import Resumable, Searching
 from sb3_mcbs.agents.roots import EnvironmentStep, Prediction
 from sb3_mcbs.agents.schedule import ScheduleSettings, SearchSchedule
 from sb3_mcbs.agents.tensorboard import write_candidates, write_hyperparameters
-from sb3_mcbs.agents.value_expansion import EXPANSION, Expanding, ValueExpansionSettings
+from sb3_mcbs.agents.value_expansion import Expanding, ValueExpansionSettings
 from sb3_mcbs.networks.torch_settings import matmul_precision
 from sb3_mcbs.search import RecentActions, SearchResult, SearchSettings
 from sb3_mcbs.search.random_streams import spawn_rng
-from sb3_mcbs.search.settings import merged
 
 SelfMCBS = TypeVar("SelfMCBS", bound="MCBS")
 
@@ -75,8 +72,6 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
         "_followed": "copies of settings",
         "candidate_values": "only shown",
     }
-    #: Set by ``sb3_mcbs.checkpoints``, which imports the agents, not the other way round.
-    _resume_as: ClassVar[Callable[..., Any]]
     _seed_at_setup: int | None = None
     _is_restored = False
 
@@ -429,34 +424,9 @@ class MCBS(SearchAttributes, Searching, Resumable, Expanding):
             settings of the search that are not given explicitly
         :return: the model
         """
-        kwargs = {
-            name: value for name, value in kwargs.items() if value is not None or name not in OF_PRESETS
-        }
-        objects = kwargs.get("custom_objects") or {}
-        refuse_old_names({**{name: objects[name] for name in MOVED.keys() & objects.keys()}, **kwargs})
-        given = {**{name: objects[name] for name in SETTINGS.keys() & objects.keys()}, **kwargs}
-        if given.get("preset") is not None:
-            kwargs = merged(settings_of_preset(given["preset"]), given)
-            kwargs |= decide_expansion(kwargs)
-        elif not given.keys().isdisjoint(EXPANSION):
-            kwargs["expansion_where_possible"] = None
-        # Older files have the keys of these as attributes, which None would leave in place.
-        kwargs = {name: {} if name in GROUPS and value is None else value for name, value in kwargs.items()}
+        kwargs = settings_to_load(kwargs)
         with moved_modules():
             return super().load(path, *args, **kwargs)
-
-    @classmethod
-    def resume(cls: type[SelfMCBS], path: str, env: GymEnv | None = None, **kwargs: Any) -> SelfMCBS:
-        """
-        Continue a run from its exact checkpoints, see :func:`sb3_mcbs.resume`.
-
-        :param path: the folder of checkpoints
-        :param env: the environment, made like the original one; None makes it from its id
-        :param kwargs: the other arguments of :func:`sb3_mcbs.resume`
-        :return: the agent
-        :raises CheckpointError: if there is no intact checkpoint, or it is of another class
-        """
-        return MCBS._resume_as(cls, path, env, **kwargs)
 
     def predict(
         self,

@@ -1,11 +1,12 @@
 """What exact checkpoints need from an agent. They import the agents, not the other way round."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection
-from typing import Any, ClassVar, Protocol
+from collections.abc import Callable, Collection
+from typing import Any, ClassVar, Protocol, Self
 
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.type_aliases import GymEnv
 
 
 class StoppedRun(Protocol):
@@ -27,7 +28,23 @@ class Resumable(OffPolicyAlgorithm):
     """
 
     not_checkpointed: ClassVar[Collection[str]] = {"_stopped_run": "only set until the run continues"}
+    #: Set by ``sb3_mcbs.checkpoints``.
+    _resume_as: ClassVar[Callable[..., Any]]
     _stopped_run: StoppedRun | None = None
+
+    @classmethod
+    def resume(cls, path: str, env: GymEnv | None = None, **kwargs: Any) -> Self:
+        """
+        Continue a run from its exact checkpoints, see :func:`sb3_mcbs.resume`.
+
+        :param path: the folder of checkpoints
+        :param env: the environment, made like the original one; None makes it from its id
+        :param kwargs: the other arguments of :func:`sb3_mcbs.resume`
+        :return: the agent
+        :raises CheckpointError: if there is no intact checkpoint, or it is of another class
+        """
+        resumed: Self = Resumable._resume_as(cls, path, env, **kwargs)
+        return resumed
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         total_timesteps, callback = super()._setup_learn(*args, **kwargs)

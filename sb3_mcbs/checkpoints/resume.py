@@ -12,7 +12,6 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 
-from sb3_mcbs.agents.mcbs import MCBS
 from sb3_mcbs.agents.resumable import Resumable
 from sb3_mcbs.checkpoints.buffers import write_rows
 from sb3_mcbs.checkpoints.components import callbacks
@@ -94,7 +93,7 @@ def resume_as(cls: type[_Agent], path: str | os.PathLike[str], env: GymEnv | Non
     return agent
 
 
-MCBS._resume_as = resume_as
+Resumable._resume_as = resume_as
 
 
 def read_run(path: str | os.PathLike[str], classes: Iterable[Any] = ()) -> "CheckpointedRun":
