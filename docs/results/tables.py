@@ -96,7 +96,8 @@ def returns_table(table: Table, data: pd.DataFrame) -> str:
     scores = scores_of(returns)
     if table.scored:
         columns[SCORE] = cells(scores)
-    columns["simulated steps, millions"] = (runs["simulated_steps"].max() / 1e6).map("{:.2f}".format)
+    columns["last step"] = runs["step"].max().map("{:,.0f}".format)
+    columns["simulated until then, millions"] = (runs["simulated_steps"].max() / 1e6).map("{:.2f}".format)
     columns = columns.reset_index().astype({"seed": str})
     if table.scored:
         columns = pd.concat([columns, summaries(scores)])
@@ -137,8 +138,8 @@ def reached_table(data: pd.DataFrame) -> str:
         ours = data[(data["run"] == f"td3_{environment}_0") & (data["policy"] == POLICIES[0])]
         (zoo,) = [curve for curve in published_curves(environment) if curve.name == "RL Zoo TD3"]
         targets = {
-            "RL Zoo's": zoo.returns[zoo.steps == 300_000].item(),
-            "ours": ours.loc[ours["step"] == 300_000, "mean"].squeeze() if len(ours) else None,
+            "RL Zoo's TD3": zoo.returns[zoo.steps == 300_000].item(),
+            "our TD3": ours.loc[ours["step"] == 300_000, "mean"].squeeze() if len(ours) else None,
         }
         row = {"environment": environment.removesuffix("-v5"), "seed": str(seed)}
         for policy in POLICIES:
