@@ -67,7 +67,7 @@ def test_a_broken_file_is_named_and_the_others_are_reported(tmp_path: Path) -> N
     lines = report(tmp_path / "logs", output=tmp_path / "report")
     assert any(str(broken) in line and "is not what an EvalCallback writes" in line for line in lines)
     assert lines[2].endswith("200, 2 runs")
-    assert "Could not be used" in check_page(tmp_path / "report" / "report.html")
+    assert "Problems:" in check_page(tmp_path / "report" / "report.html")
     np.savez(broken, timesteps=[1, 2], results=np.zeros((1, 2)), ep_lengths=np.zeros((1, 2)))
     assert "results has the shape (1, 2)" in " ".join(load_results(tmp_path / "logs").problems)
     np.savez(broken, timesteps=[2, 1], results=np.zeros((2, 2)))

@@ -126,6 +126,11 @@ def _check(arrays: dict[str, np.ndarray]) -> None:
             raise ValueError(f"{key} has values of type {arrays[name].dtype}")
     if not arrays["returns"].size:
         raise ValueError("there is no evaluation in it")
+    for name in ("timesteps", "simulated_steps", "seconds"):
+        if name in arrays and not np.isfinite(arrays[name]).all():
+            raise ValueError(f"{name} are not recorded, or not finite, in every evaluation")
+    if arrays.get("lengths", arrays["returns"]).shape != arrays["returns"].shape:
+        raise ValueError("there are not as many lengths as returns")
     if np.any(np.diff(arrays["timesteps"]) <= 0):
         raise ValueError("timesteps do not increase")
 

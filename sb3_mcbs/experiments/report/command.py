@@ -31,10 +31,17 @@ def main() -> None:
     parser.add_argument("--algo", default="mcbs_td3", help="algorithm of the newest run (%(default)s)")
     parser.add_argument("--env", default="HalfCheetah-v5", help="environment of the newest run (%(default)s)")
     parser.add_argument("-f", "--log-folder", default="logs", help="where RL Zoo logs (%(default)s)")
-    parser.add_argument("-o", "--output", type=Path, help="where to write (PATH/report, of the first)")
+    parser.add_argument(
+        "-o", "--output", type=Path, help="where to write (PATH/report); needed with several PATHs or --arms"
+    )
     parser.add_argument("--baseline", metavar="ARM", help="what others are compared with (the first arm)")
     parser.add_argument("--arms", metavar="ARM", nargs="+", help="those to show, in this order (all)")
-    args = parser.parse_args()
+    args = parser.parse_intermixed_args()
+    mistaken = [] if args.paths else [arm for arm in args.arms or [] if Path(arm).exists()]
+    if mistaken:
+        parser.error(f"{mistaken[0]} was read as an arm: name paths before --arms.")
+    if args.output is None and (len(args.paths) > 1 or args.arms):
+        parser.error("With several paths, or with --arms, name the folder to write to: -o FOLDER.")
     try:
         paths = args.paths or [newest_run(args.log_folder, args.algo, args.env)]
         output = args.output or (paths[0].parent if paths[0].is_file() else paths[0]) / "report"
@@ -56,8 +63,8 @@ def report(
     :return: the lines to print
     :raises PathError: if a path has nothing to report, or would be replaced
     """
-    if any(path.resolve() == (output / "evaluations.csv").resolve() for path in paths):
-        raise PathError(f"A report in {output} would replace the file that is read: name another -o.")
+    if any(path.is_file() and path.resolve().parent == output.resolve() for path in paths):
+        raise PathError(f"A report in {output} could replace a file that is read: name another -o.")
     results = load_results(*paths, baseline=baseline, arms=arms)
     if len(results.evaluated) > 1:
         import_rliable()
@@ -71,7 +78,7 @@ def report(
     page = output / "report.html"
     page.write_text(render(results, parts, _commands(results, paths, baseline, arms)), encoding="utf-8")
     if len(results.runs) == 1 and results.runs[0].folder.is_dir() and not results.frozen:
-        return [*_single(results, output), f"Report:         {page}"]
+        return [*_single(results, output), *results.problems, f"Report:         {page}"]
     return [*summary(results), *results.problems, f"Report: {page}"]
 
 
@@ -95,12 +102,13 @@ def _single(results: Results, output: Path) -> list[str]:
 def _commands(
     results: Results, paths: Sequence[Path], baseline: str | None, arms: Sequence[str] | None
 ) -> list[str]:
-    names = [path.absolute().name for path in paths]
+    # Not whole paths, which would say more than others need to know.
+    names = [str(Path(*path.absolute().parts[-2 if path.is_file() else -1 :])) for path in paths]
     options = [*names, *(["--baseline", baseline] if baseline else []), *(["--arms", *arms] if arms else [])]
     command = shlex.join(["sb3-mcbs", "report", *options])
     if results.spec:
         return [shlex.join(["sb3-mcbs", "experiment", f"{names[0]}/spec.yml", "-o", names[0]]), command]
-    if any(path.is_file() for path in paths):
+    if len(paths) > 1 or paths[0].is_file():
         return [command]
     return ["# each run by its folder", "sb3-mcbs repeat RUN_FOLDER", command]
 

@@ -180,7 +180,10 @@ def draw_curves(
             axes.plot(x, y, color=MUTED, linewidth=1.2, linestyle=":", marker=".", zorder=1)
         _name_ends(axes, published)
         axes.set(xlabel=xlabel, ylabel="return")
-        if log:  # few decades would have labels between them too
+        if log:
+            low, high = axes.get_xlim()
+            places = (1.0,) if high / low > 100 else (1.0, 2.0, 5.0)
+            axes.xaxis.set_major_locator(matplotlib.ticker.LogLocator(subs=places))
             axes.xaxis.set_minor_formatter(matplotlib.ticker.NullFormatter())
         else:
             axes.xaxis.set_major_locator(matplotlib.ticker.MaxNLocator(6))

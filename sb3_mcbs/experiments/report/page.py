@@ -258,7 +258,7 @@ def summary(results: Results) -> list[str]:
     :return: what the command prints: returns of all arms
     """
     finished = sum(run.state == FINISHED for run in results.runs)
-    lines = [f"{len(results.runs)} runs, {finished} finished"]
+    lines = [f"{len(results.runs)} run{'s' * (len(results.runs) > 1)}, {finished} finished"]
     for task in results.tasks:
         when = "" if results.frozen else f", interquartile mean after {common_step(results, task)} steps"
         lines.append(f"{task}{when}:")
