@@ -165,6 +165,8 @@ def test_the_command_checks_and_chooses(
     (line,) = capsys.readouterr().out.splitlines()
     assert line.startswith(f"{MCBS}: mcbs_td3, 400 steps, hyperparameters of mcbs_td3.yml: Pendulum-v1 with")
     assert not (tmp_path / "results").exists()
+    say("--check", "--only", TD3)  # which is a part of the other's name
+    assert [line.partition(":")[0] for line in capsys.readouterr().out.splitlines()] == [TD3]
     assert f"no run has such a name; the runs are {TD3}, {MCBS}." in str(say("--only", "sac*"))
     spec.write_text(spec.read_text().replace("steps: 400", "steps: none"))
     assert str(say("--check")).startswith(f"sb3-mcbs experiment: {spec}, line 5: steps: must be an integer")

@@ -78,7 +78,9 @@ def _parser() -> argparse.ArgumentParser:
         help=f"runs at a time (here {usable_cores()}; with Ray as many as the cluster takes)",
     )
     parser.add_argument(
-        "--only", metavar="PATTERN", help="runs whose name has this in it, or matches it with *"
+        "--only",
+        metavar="PATTERN",
+        help="the run of this name, or those whose name has this in it, or matches it with *",
     )
     parser.add_argument("--check", "--dry-run", action="store_true", help="check the spec and list its runs")
     parser.add_argument(
@@ -100,8 +102,9 @@ def _parser() -> argparse.ArgumentParser:
 def _matching(runs: list[Run], pattern: str | None) -> list[Run]:
     if pattern is None:
         return runs
-    whole = pattern if any(sign in pattern for sign in "*?[") else f"*{pattern}*"
-    chosen = [run for run in runs if fnmatch.fnmatchcase(run.name, whole)]
+    is_name = any(run.name == pattern for run in runs)  # which may be a part of another's
+    whole = pattern if is_name or any(sign in pattern for sign in "*?[") else f"*{pattern}*"
+    chosen = [run for run in runs if run.name == whole or fnmatch.fnmatchcase(run.name, whole)]
     if not chosen:
         names = ", ".join(run.name for run in runs[:10]) + (", ..." if len(runs) > 10 else "")
         raise SpecError(f"--only {pattern}: no run has such a name; the runs are {names}.")
