@@ -25,7 +25,7 @@ ENVIRONMENTS = ["HalfCheetah-v5", "Walker2d-v5", "Hopper-v5", "Ant-v5"]
 ARMS = ["td3", "mcbs_td3-paper", "mcbs_td3-stored", "mcbs_crossq", "no-search", "crossq", "crossq-n3"]
 #: Arms of the pictures, and patterns of those in the tables.
 CURVES = ["td3", "mcbs_td3-paper", "crossq", "no-search", "mcbs_crossq"]
-ON_CROSSQ, ON_TD3 = "(?!td3|mcbs_td3).*", "(td3|mcbs_td3).*"
+ON_CROSSQ, ON_TD3 = "(?!td3|mcbs_td3|copies).*", "(td3|mcbs_td3).*"
 
 
 class Table(NamedTuple):
@@ -47,6 +47,7 @@ class Table(NamedTuple):
 
 TABLES = {
     "protocol": Table("protocol", [15_000, 30_000, 45_000, 60_000, 100_000], scored=True),
+    "copies": Table("protocol", [320_000 * n for n in (2, 3, 4, 6, 9, 12)], arms="copies"),
     "environments": Table("protocol", [20_000, 30_000, 45_000, 60_000, 80_000, 100_000], others=True),
     "screens": Table("screen", [10_000, 20_000, 30_000, 40_000], others=True),
     "screen": Table("screen", [10_000, 15_000, 30_000, 45_000, 60_000], scored=True),
@@ -121,12 +122,13 @@ def scores_of(returns: pd.DataFrame) -> pd.DataFrame:
 
 
 def summaries(scores: pd.DataFrame) -> pd.DataFrame:
-    """A row for each arm of which four runs or more have a score."""
+    """A row for each arm of which three runs or more have a score."""
     found = []
     for (environment, arm), part in scores.dropna().groupby(level=[0, 1]):
-        if len(part) >= 4:
+        if len(part) >= 3:  # of three nothing is trimmed
+            what = "mean of 3" if len(part) == 3 else f"interquartile mean of {len(part)}"
             both = " / ".join(f"{trim_mean(part[policy], 0.25):.0f}" for policy in POLICIES)
-            found.append((environment, arm, f"interquartile mean of {len(part)}", f"**{both}**"))
+            found.append((environment, arm, what, f"**{both}**"))
     return pd.DataFrame(found, columns=["environment", "arm", "seed", SCORE])
 
 
