@@ -39,11 +39,8 @@ def test_evaluations_csv_is_as_good_as_the_folder(make, tmp_path: Path) -> None:
     assert names == {path.name for path in (tmp_path / "second").iterdir()}
     assert "sb3-mcbs report first/evaluations.csv</pre>" in check_page(tmp_path / "second" / "report.html")
     for of_folder, of_file in zip(load_results(folder).evaluated, load_results(csv).runs, strict=True):
-        assert (of_folder.seed, of_folder.state, of_folder.task) == (
-            of_file.seed,
-            of_file.state,
-            of_file.task,
-        )
+        for attribute in ("name", "arm", "task", "environment", "seed", "state", "settings"):
+            assert getattr(of_folder, attribute) == getattr(of_file, attribute)
         assert of_folder.policies.keys() == of_file.policies.keys()
         for policy, expected in of_folder.policies.items():
             found = of_file.policies[policy]

@@ -9,14 +9,16 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pandas as pd
-from scipy.stats import trim_mean
 
 from sb3_mcbs.experiments.report.curves import curve_pictures
 from sb3_mcbs.experiments.report.references import published_curves
+from sb3_mcbs.experiments.report.runs import Competitor
 from sb3_mcbs.experiments.report.sources import load_results
+from sb3_mcbs.experiments.report.statistics import first_at
+from sb3_mcbs.zoo.evaluations import ACTOR, SEARCH, Evaluations, interquartile_mean
 
 HERE = Path(__file__).resolve().parent
-RUN, POLICIES = ["experiment", "environment", "arm", "seed"], ["actor alone", "actor with search"]
+RUN, POLICIES = ["experiment", "environment", "arm", "seed"], [ACTOR, SEARCH]
 #: A run's score is the mean of its evaluations from the first to the last of these steps.
 SCORED = 45_000, 60_000
 SCORE = "mean of 45,000 to 60,000"
@@ -127,31 +129,34 @@ def summaries(scores: pd.DataFrame) -> pd.DataFrame:
     for (environment, arm), part in scores.dropna().groupby(level=[0, 1]):
         if len(part) >= 3:  # of three nothing is trimmed
             what = "mean of 3" if len(part) == 3 else f"interquartile mean of {len(part)}"
-            both = " / ".join(f"{trim_mean(part[policy], 0.25):.0f}" for policy in POLICIES)
+            both = " / ".join(f"{interquartile_mean(part[policy].to_numpy()):.0f}" for policy in POLICIES)
             found.append((environment, arm, what, f"**{both}**"))
     return pd.DataFrame(found, columns=["environment", "arm", "seed", SCORE])
 
 
-def reached_table(data: pd.DataFrame) -> str:
+def reached_table() -> str:
     """When ``mcbs_crossq`` first returns what TD3's actor does after 300,000 steps."""
+    results = load_results(HERE / "evaluations.csv")
     rows = []
-    runs = data[(data["experiment"] == "protocol") & (data["arm"] == "mcbs_crossq")]
-    for (environment, seed), run in runs.groupby(["environment", "seed"]):
-        ours = data[(data["run"] == f"td3_{environment}_0") & (data["policy"] == POLICIES[0])]
-        (zoo,) = [curve for curve in published_curves(environment) if curve.name == "RL Zoo TD3"]
+    for run in sorted(results.runs, key=lambda run: ENVIRONMENTS.index(run.environment)):
+        if run.arm != "mcbs_crossq":
+            continue
+        (zoo,) = [curve for curve in published_curves(run.environment) if curve.name == "RL Zoo TD3"]
+        ours = [each.policies[ACTOR].means[-1] for each in results.of(run.task, Competitor("td3", ACTOR))]
         targets = {
             "RL Zoo's TD3": zoo.returns[zoo.steps == 300_000].item(),
-            "our TD3": ours.loc[ours["step"] == 300_000, "mean"].squeeze() if len(ours) else None,
+            "our TD3": ours[0] if ours else None,
         }
-        row = {"environment": environment.removesuffix("-v5"), "seed": str(seed)}
+        row = {"environment": run.environment.removesuffix("-v5"), "seed": str(run.seed)}
         for policy in POLICIES:
             for whose, target in targets.items():
-                row[f"{policy.replace('actor ', '')}: {whose}"] = first(run[run["policy"] == policy], target)
+                reached = first(run.policies[policy], target)
+                row[f"{policy.replace('actor ', '')}: {whose}"] = reached
         rows.append(row)
     return markdown(pd.DataFrame(rows))
 
 
-def first(evaluations: pd.DataFrame, target: float | None) -> str:
+def first(evaluations: Evaluations, target: float | None) -> str:
     """Steps and minutes until the first evaluation that reaches a return.
 
     :param evaluations: of one policy of a run.
@@ -159,17 +164,17 @@ def first(evaluations: pd.DataFrame, target: float | None) -> str:
     """
     if target is None:
         return "–"
-    reached = evaluations[evaluations["mean"] >= target]
-    if reached.empty:
-        return f"not by {evaluations['step'].max():,.0f}"
-    earliest = reached.loc[reached["step"].idxmin()]
-    return f"{earliest['step']:,.0f} ({earliest['seconds'] / 60:.0f} min)"
+    index = first_at(evaluations, target)
+    if index is None:
+        return f"not by {evaluations.timesteps[-1]:,.0f}"
+    assert evaluations.seconds is not None
+    return f"{evaluations.timesteps[index]:,.0f} ({evaluations.seconds[index] / 60:.0f} min)"
 
 
 def with_tables(page: str, data: pd.DataFrame) -> str:
     """A page with the present tables between its markers."""
     texts = {name: returns_table(table, data) for name, table in TABLES.items()}
-    texts["reached"] = reached_table(data)
+    texts["reached"] = reached_table()
     for name, text in texts.items():
         if f"<!-- {name} -->" in page:
             before, rest = page.split(f"<!-- {name} -->\n")

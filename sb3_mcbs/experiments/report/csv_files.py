@@ -58,12 +58,11 @@ def _run_records(results: Results) -> list[dict[str, object]]:
 def _evaluation_records(results: Results) -> list[dict[str, object]]:
     records: list[dict[str, object]] = []
     for run in results.evaluated:
+        of_run: dict[str, object] = {name: getattr(run, name) for name in (*_IDENTITY[1:], *_LAST)}
+        of_run = {"run": run.name, **of_run, "settings": json.dumps(run.settings, default=str)}
         for policy, each in run.policies.items():
             for index in range(len(each.timesteps)):
-                record: dict[str, object] = {"run": run.name}
-                record |= {name: getattr(run, name) for name in (*_IDENTITY[1:], *_LAST)}
-                record["settings"] = json.dumps(run.settings, default=str)
-                record |= {"policy": policy, **each.costs(index)}
+                record = {**of_run, "policy": policy, **each.costs(index)}
                 record["mean_return"] = float(each.means[index])
                 for episode, value in enumerate(each.returns[index]):
                     record[f"return_{episode}"] = float(value)

@@ -4,6 +4,7 @@ import json
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
+from operator import attrgetter
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,6 +14,9 @@ from sb3_mcbs.experiments.report.csv_files import read_evaluations
 from sb3_mcbs.experiments.report.runs import Result, Results, load_folder
 from sb3_mcbs.experiments.results import FINISHED
 from sb3_mcbs.zoo.paths import PathError
+
+#: What the same run has in every source.
+_identity = attrgetter("name", "arm", "task", "seed")
 
 
 def load_results(*paths: Path, baseline: str | None = None, arms: Sequence[str] | None = None) -> Results:
@@ -51,7 +55,7 @@ def _join(paths: Sequence[Path], parts: list[Results]) -> Results:
     _check(paths, parts)
     problems = [problem for part in parts for problem in part.problems]
     kept: list[Result] = []
-    for run in _tell_apart(parts):
+    for run in _name_by_source(parts):
         place = next((place for place, other in enumerate(kept) if _are_one(other, run)), None)
         if place is None:
             kept.append(run)
@@ -89,7 +93,7 @@ def _check(paths: Sequence[Path], parts: list[Results]) -> None:
                 )
 
 
-def _tell_apart(parts: list[Results]) -> list[Result]:
+def _name_by_source(parts: list[Results]) -> list[Result]:
     """All runs. Arms of one name whose settings differ are different arms, and get their source's name."""
     settings = defaultdict(set)
     for run in [run for part in parts for run in part.runs if run.settings]:
@@ -115,9 +119,8 @@ def _are_one(first: Result, second: Result) -> bool:
     """Whether two sources have the same run."""
     if first.folder.is_dir() and first.folder.resolve() == second.folder.resolve():
         return True
-    for name in ("name", "arm", "task", "seed"):
-        if getattr(first, name) != getattr(second, name):
-            return False
+    if _identity(first) != _identity(second):
+        return False
     # Without seeds only their returns can tell.
     common = _compare(first, second)
     return first.seed is not None or (common.n > 0 and common.equal)
